@@ -64,7 +64,7 @@ class Kept:
 
     @property
     def is_due(self) -> bool:
-        """Whether folding has still to do with it."""
+        """True while a commit, or a part of its retract, waits to be folded."""
         return self.is_waiting or self.due_from is not None
 
     def stored(self) -> StoredCommit:

@@ -11,7 +11,7 @@ LEVELS = 16
 
 @dataclass
 class Node:
-    """Of a .bt occupied leaves have log-odds of 1, free ones of -1, and inner nodes none."""
+    """Node of an octree; in a .bt, occupied leaves have log-odds of 1, free ones of -1, and inner nodes none."""
 
     odds: float | None
     rgb: tuple[int, ...] = (255, 255, 255)

@@ -353,13 +353,9 @@ class Robot:
         return self._commit(note, retracts, profile, remember)
 
     def _commit(
-        self,
-        note: str = "",
-        retracts: tuple[CommitId, ...] = (),
-        profile: Profile | None = None,
-        remember: Mapping[str, str] = NO_NOTES,
+        self, note: str, retracts: tuple[CommitId, ...], profile: Profile | None, remember: Mapping[str, str]
     ) -> Commit | None:
-        """Commit the open measurement; `close` does it, too."""
+        """Commit the open measurement, of a robot that is open or being closed."""
         diff = self._measurement.diff() if self._measurement else {}
         counts = self._measurement.counts if self._measurement else ReturnCounts()
         # No evidence is no commit, except to take others out.
@@ -473,7 +469,7 @@ class Robot:
             self._rounds.stop()
             # The last measurement first, then one push; a robot whose commit was refused does not leave the map.
             try:
-                self._commit()
+                self._commit("", (), None, NO_NOTES)
             except CairnError:
                 self._rounds.finish(is_leaving=False, within_s=flush_s)
                 raise

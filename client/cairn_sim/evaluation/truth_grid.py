@@ -20,6 +20,7 @@ import numpy.typing as npt
 
 from cairn_calib.rig.lidar import AnyCamera
 from cairn_calib.rig.poses import Transform, check_transform
+from cairn_calib.rig.rig import TIME_OF_FLIGHT_REACH_M
 from cairn_map.arrays import Flags, Floats
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.grid import NANOMETRES, CellKey, Geometry, cell_of_key
@@ -36,8 +37,6 @@ VOXELS_MAX = 1 << 28
 SAMPLES_PER_VOXEL = 64
 HALF_SOLID = SAMPLES_PER_VOXEL // 2
 """A voxel with as many samples in solids is solid."""
-MAX_RANGE_M = 10.0
-"""Reach of the camera, metres; as `Integrator.max_range_m`."""
 FINENESS = 4
 """Rays along a pixel's edge: 1.7 cm apart at 10 m for the ToF camera."""
 
@@ -174,7 +173,7 @@ def seen_marks(
     *,
     camera: AnyCamera,
     T_map_cameras: Sequence[Transform],
-    max_range_m: float = MAX_RANGE_M,
+    max_range_m: float = TIME_OF_FLIGHT_REACH_M,
     fineness: int = FINENESS,
 ) -> list[Marks]:
     """Marks of the voxels that a camera could have seen in each box: (X, Y, Z) 0, PASSED or HIT.
@@ -223,7 +222,7 @@ def truths_of(
     *,
     camera: AnyCamera,
     T_map_cameras: Sequence[Transform],
-    max_range_m: float = MAX_RANGE_M,
+    max_range_m: float = TIME_OF_FLIGHT_REACH_M,
     fineness: int = FINENESS,
 ) -> list[Truth]:
     """The truth about each box for one camera's trajectory; the arguments are those of `seen_marks`."""

@@ -25,7 +25,7 @@ from cairn_calib.rig.brown import radius_limit
 from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.lidar import AnyCamera
 from cairn_calib.rig.poses import Transform, inverse, transform_points
-from cairn_calib.rig.rig import Rig
+from cairn_calib.rig.rig import TIME_OF_FLIGHT_REACH_M, Rig
 from cairn_fusion.image_fusion.cross_view_kernels import places_into
 from cairn_fusion.image_fusion.row_bands import run_in_bands
 from cairn_fusion.image_fusion.surface_kernels import (
@@ -48,7 +48,6 @@ Values = npt.NDArray[np.float32]
 COVER = 1.5
 """Width of a range pixel in `live_range`, over the distance to the next one: slanted surfaces are sampled wider."""
 MIN_RANGE_M = 0.1
-MAX_RANGE_M = 10.0
 FLYING_STEP_M = 0.05
 """Limits of `range_labels`, as those of `integrate.Integrator`."""
 AMPLITUDE_MAX = 65535
@@ -70,7 +69,7 @@ def range_labels(
     rig: Rig,
     *,
     min_range_m: float = MIN_RANGE_M,
-    max_range_m: float = MAX_RANGE_M,
+    max_range_m: float = TIME_OF_FLIGHT_REACH_M,
     flying_step_m: float = FLYING_STEP_M,
 ) -> Labels:
     """(H, W) uint8 `Label` of each pixel of the scan's range camera: OK, NO_RANGE, SATURATED or FLYING.

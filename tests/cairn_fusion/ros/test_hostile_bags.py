@@ -83,7 +83,7 @@ def test_a_chunk_of_very_many_records_is_refused(tmp_path: Path, monkeypatch: py
 
 
 def test_a_message_that_waits_counts_as_its_whole_chunk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of each chunk one small message waits; it keeps the chunk."""
+    """A small message that waits for its turn keeps its whole unpacked chunk in memory."""
     monkeypatch.setattr(mcap_bag, "WAITING_BYTES_MAX", 1 << 20)
     chunk = message2(TIME_NS) + record2(0x99, bytes(300_000))
     assert messages_of(write_mcap(tmp_path / "few.mcap", [chunk] * 3)) == 3

@@ -11,7 +11,7 @@ import pytest
 from tests.fixtures.map.bombs import DEEP, cell_of_air
 from tests.fixtures.map.costly import air, dust
 from tests.fixtures.map.made import random_evidence
-from tests.fixtures.server.folding import FAR, HERE, THERE, WIDE, Folder, cells_of, costly, scan, straight
+from tests.fixtures.server.folding import FAR, HERE, THERE, WIDE, Folder, cells_of, costly, scan, small_slices, straight
 from tests.fixtures.server.pushes import MOLE, WREN, pushed
 from tests.fixtures.server.store_contract import NAMES, new_of
 from tests.memory_store.store import MemoryStore
@@ -32,6 +32,8 @@ from cairn_server.store.stamps import decode_stamps
 from cairn_server.store.store import Store
 from cairn_server.store.store_rows import Fold, MapRow, StoredCommit
 
+__all__ = ["small_slices"]
+
 
 @pytest.fixture(params=["memory", "disk"])
 def store(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Store]:
@@ -41,15 +43,6 @@ def store(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Store]:
     kept = SqliteStore(tmp_path)
     yield kept
     kept.close()
-
-
-@pytest.fixture
-def small_slices(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Air and dust of small cells are as costly as those of large ones, so that tests are quick."""
-    for module in (commit_work, fold_lanes):
-        monkeypatch.setattr(module, "SLICE_S", 1e-4)
-        monkeypatch.setattr(module, "SLICE_S_PER_BYTE", 1e-9)
-    monkeypatch.setattr(commit_work, "CELL_S", 0.0)
 
 
 def test_dust_air_and_very_many_cells_are_known_to_be_costly_before_they_are_decoded_and_scans_are_not() -> None:

@@ -10,13 +10,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from tests.fixtures.map.costly import air, dust
 from tests.fixtures.map.made import SMALL, random_evidence
-from tests.fixtures.server.folding import FAR, HERE, THERE, WIDE, Folder, cells_of, costly, scan, straight
+from tests.fixtures.server.folding import FAR, HERE, THERE, WIDE, Folder, cells_of, costly, scan, small_slices, straight
 from tests.fixtures.server.pushes import MOLE, WREN, pushed, read, sum_of
 from tests.fixtures.server.store_contract import NAMES, new_of
 from tests.memory_store.store import MemoryStore
 
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.ids import CommitId
+from cairn_map.evidence.grid import cell_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.wire.messages import LogEntry
 from cairn_server.folding import commit_work, fold_lanes
@@ -28,6 +29,9 @@ from cairn_server.store.store import Store
 from cairn_server.store.store_rows import MapRow, StoredCommit
 
 ANY_SIZE = 1 << 30
+KEYS = [cell_key((n, 0, 0)) for n in range(5)]
+
+__all__ = ["small_slices"]
 
 
 @pytest.fixture(params=["memory", "disk"], scope="module")
@@ -44,16 +48,6 @@ def store(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
 def single_names(monkeypatch: pytest.MonkeyPatch) -> None:
     """A part is one name."""
     monkeypatch.setattr(commit_work, "PART_NAMES_MAX", 1)
-
-
-@pytest.fixture
-def small_slices(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Air and dust of small cells are as costly as those of large ones."""
-    for module in (commit_work, fold_lanes):
-        monkeypatch.setattr(module, "SLICE_S", 1e-4)
-        monkeypatch.setattr(module, "SLICE_S_PER_BYTE", 1e-9)
-    monkeypatch.setattr(commit_work, "CELL_S", 0.0)
-    monkeypatch.setattr(fold_lanes, "NAME_S", 0.0)
 
 
 def out(n: int, retracts: Sequence[Commit]) -> Commit:
@@ -144,7 +138,7 @@ def test_a_part_is_what_one_commit_may_have_or_one_commit_of_any_size(
 ) -> None:
     row, _ = store.create_map(next(NAMES), WIDE, SensorModel())
     sizes = [2, 1, 1, 5, 1]
-    commits = [costly(n, dust(WIDE), keys=[HERE, THERE, FAR, 3, 4][:count]) for n, count in enumerate(sizes)]  # type: ignore[list-item]
+    commits = [costly(n, dust(WIDE), keys=KEYS[:count]) for n, count in enumerate(sizes)]
     gone, unknown = costly(7, air(WIDE)), costly(8, air(WIDE))
     for commit in [*commits, gone, pushed(6, 0, geometry=WIDE, cells={}, retracts=[gone])]:
         store.append(row, new_of(commit))
