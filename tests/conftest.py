@@ -1,5 +1,6 @@
-"""Order of the files (the slowest first, so that no worker has one left when the others are done), and signals."""
+"""Order of the files (the slowest first, so that no worker has one left when others are done), stores, and signals."""
 
+import os
 import signal
 from collections.abc import Iterator
 
@@ -27,6 +28,14 @@ SLOWEST = (
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     ranks = {path: rank for rank, path in enumerate(SLOWEST)}
     items.sort(key=lambda item: ranks.get(item.nodeid.partition("::")[0], len(SLOWEST)))
+
+
+def pytest_sessionstart() -> None:
+    if os.environ.get("CAIRN_TEST_STORE") == "postgresql":
+        from tests.fixtures.server.database_stores import database_store
+        from tests.fixtures.server.stores import OPENERS
+
+        OPENERS["postgresql"] = database_store
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -156,7 +156,8 @@ def test_errors_name_the_cause_and_have_an_exit_code_of_their_own(server: str, t
     assert "[no_cell]" in typed("map", "get", f"{server}/maps/lab", "9,9,9", "-o", "x.ply", folder=tmp_path, code=3)
     assert "[no_map]" in cairn("map", "info", f"{server}/maps/none", folder=tmp_path, code=3)
     other = cairn("map", "create", f"{server}/maps/lab", "--voxel", "0.02", folder=tmp_path, code=4)
-    assert "another geometry" in other
+    assert "map lab exists with voxels of 0.04 m" in other
+    assert "voxels of 0.02 m" in other
     assert "is `cairn serve` running?" in typed("map", "ls", "http://127.0.0.1:9", folder=tmp_path, code=5)
     assert "http://HOST:PORT/maps/NAME" in cairn("map", "info", server, folder=tmp_path, code=1)
     assert "looked for" in cairn("robot", "replay", ".", "--map", f"{server}/maps/lab", folder=tmp_path, code=1)

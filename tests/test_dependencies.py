@@ -128,7 +128,11 @@ def test_the_locks_fulfil_what_is_asked_for_and_have_a_hash_for_everything() -> 
     lines = (ROOT / "docker/build.in").read_text().splitlines()
     sources = [Requirement(line) for line in lines if not line.startswith("#")]
     assert {Requirement(text) for text in (*build, NODE_WHEEL)} == set(sources), "`make lock` reads build.in"
-    for name, requirements in (("server.lock", asked("server")), ("build.lock", sources)):
+    for name, requirements in (
+        ("server.lock", asked("server")),
+        ("scale.lock", asked("server", "postgresql")),
+        ("build.lock", sources),
+    ):
         text, versions = (ROOT / "docker" / name).read_text(), locked(name)
         for requirement in requirements:
             found = [version for package, version in versions if package == name_of(requirement.name)]

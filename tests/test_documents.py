@@ -2,6 +2,8 @@
 
 import argparse
 import ast
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,7 @@ PAGES_WITH_COMMANDS = {
     "operator.md",
     "paper-experiment.md",
     "robot-developer.md",
+    "scale.md",
     "python-api.md",
     "simulated_robot.py",
 }
@@ -52,3 +55,14 @@ def test_programs_of_a_page_import_only_names_of_the_public_door(page: Path) -> 
             if isinstance(node, ast.ImportFrom) and str(node.module).startswith("cairn"):
                 assert node.module == "cairn", f"{page.name}: from {node.module} import ..."
                 assert {alias.name for alias in node.names} <= set(cairn.__all__)
+
+
+@pytest.mark.processes
+def test_the_robot_of_the_readme_passes_a_type_checker(tmp_path: Path) -> None:
+    root = Path(__file__).parents[1]
+    example = next(program for program in programs_of(root / "README.md") if "with Robot(" in program)
+    (tmp_path / "robot.py").write_text(example)
+    options = ["--config-file", str(root / "pyproject.toml"), "--cache-dir", str(tmp_path / "cache")]
+    command = [sys.executable, "-m", "mypy", *options, str(tmp_path / "robot.py")]
+    checked = subprocess.run(command, capture_output=True, text=True, cwd=root, check=False)
+    assert checked.returncode == 0, checked.stdout + checked.stderr

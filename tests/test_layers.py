@@ -74,9 +74,9 @@ MAY_NAME = {
         "cairn_client/replica/replica_store.py",
         "cairn_fusion/ros/db3_bag.py",
     ],
-    "psycopg": [],
+    "psycopg": ["cairn_server/store/postgres/*.py"],
     "cryptography": ["cairn_map/commits/signature.py", "cairn_server/access/own_names.py"],
-    "laspy": ["cairn_map/files/laz.py"],
+    "laspy": ["cairn_map/files/laz.py", "cairn_fusion/clouds/cloud_file.py"],
     "lazrs": ["cairn_map/files/laz.py"],
     "small_gicp": ["cairn_client/robot/alignment.py"],
     "mcap": ["cairn_fusion/ros/mcap_bag.py"],
@@ -100,12 +100,12 @@ ROOMS = {
         warm_up
     """,
     "cairn_calib": "rig exchange board solve diagnosis report thermal verify cli",
-    "cairn_fusion": "recording ros transfer mapping image_fusion view importers warm_up",
+    "cairn_fusion": "recording clouds ros transfer mapping image_fusion view importers warm_up",
     "cairn_client": "replica sync http relay robot folders cli cli.maps cli.robots main",
     "cairn_sim": "scene render robots evaluation experiment study demo sim_command warm_up",
     "cairn_server": """
-        memory_shares settings processes
-        store store.sqlite metrics access live folding sync.checks sync views
+        memory_shares cell_room settings processes
+        store store.sqlite store.postgres metrics access live folding sync.checks sync views
         maps service
         http.middleware http.routes http operations
     """,

@@ -20,7 +20,9 @@ from tests.fixtures.calib.thermal_images import SIZE, black_bodies
 from tests.fixtures.client.live_server import wait_until
 from tests.fixtures.client.robots import robot_in
 from tests.fixtures.commands import cairn, record_room, served
+from tests.fixtures.fusion import cloud_forms
 from tests.fixtures.fusion.bags import recorded, small_recording, write_bag
+from tests.fixtures.fusion.pose_forms import kitti
 from tests.fixtures.pages import DOCS, ROOT, commands_of
 from tests.fixtures.server.live import free_port
 from tests.fixtures.sim.drive import record_drive
@@ -178,10 +180,33 @@ def test_commands_of_the_readme_run(page: Page) -> None:
     page.run(ROOT / "README.md", instead={"serve --data demo/server": serve})
 
 
+def write_set(folder: Path) -> None:
+    """A set as TUM publishes RGB-D: folders by name, names that are times, poses by time."""
+    wall = np.full((48, 64), 5000, np.uint16)
+    for n in range(3):
+        for name, image in (("depth", wall), ("rgb", np.full((48, 64, 3), 80, np.uint8))):
+            path = folder / "SET" / name / f"{1305031102 + n / 30 + 0.004 * (name == 'rgb'):.6f}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(path), image)
+    rows = [f"{1305031101.9 + n / 10:.6f} {0.01 * n} 0 0 0 0 0 1\n" for n in range(6)]
+    (folder / "groundtruth.txt").write_text("".join(rows))
+
+
+def write_clouds(folder: Path) -> None:
+    """Sweeps as KITTI publishes them, and their poses."""
+    poses = [cloud_forms.pose_of(0.3 * n, 0.4 * n) for n in range(3)]
+    (folder / "velodyne").mkdir()
+    for n, T in enumerate(poses):
+        cloud_forms.kitti_bin(folder / "velodyne" / f"{n:06d}", cloud_forms.seen(T, cloud_forms.beams(2000, seed=n)))
+    kitti(folder, poses)
+
+
 def test_commands_of_the_page_for_robot_developers_run(page: Page) -> None:
     record_room(page.folder / "RECORDING")
     shutil.copytree(page.folder / "RECORDING", page.folder / "SPOOL" / "one")
     write_frames(page.folder / "FOLDER")
+    write_clouds(page.folder)
+    write_set(page.folder)
     room = small_recording(page.folder / "bagged")
     write_bag(page.folder / "bag", "mcap", lambda make: recorded(room, make)).rename(page.folder / "lab.mcap")
     page.serve("127.0.0.1", "--data", "server")
@@ -294,6 +319,13 @@ def test_commands_of_the_page_for_calibration_engineers_run(page: Page) -> None:
     def write_rig(rig: Rig) -> None:
         (folder / "rig.json").write_bytes(rig.to_json())
 
+    def write_recalibrated() -> None:
+        moved = {name: mount_camera(m.spectrum, m.camera, m.transform @ step) for name, m in head.cameras.items()}
+        (folder / "recalibrated.json").write_bytes(Rig(name="head", cameras=moved).to_json())
+
+    step = np.eye(4)
+    step[0, 3] = 0.02
+    page.serve("127.0.0.1", "--data", "server")
     page.run(
         DOCS / "calibration-engineer.md",
         instead=dict.fromkeys(ELSEWHERE, lambda: None),
@@ -305,5 +337,6 @@ def test_commands_of_the_page_for_calibration_engineers_run(page: Page) -> None:
             "calib thermal fit blackbody.csv calibrated.json --rig rig.json --camera thermal_left": (
                 lambda: write_rig(camera)
             ),
+            "reprocess cairn-mole --rig recalibrated.json --dry-run": write_recalibrated,
         },
     )

@@ -26,12 +26,13 @@ from websockets.typing import Origin
 from cairn_client.http.api import MapApi
 from cairn_map.errors import UnreachableError
 from cairn_map.wire.messages import CreateMap
+from cairn_server.settings import Settings
 
 pytestmark = pytest.mark.processes
 
 ROOT = Path(__file__).parents[1]
 CADDYFILE = ROOT / "docker" / "Caddyfile"
-COMPOSE = ROOT / "docker" / "compose.yaml"
+COMPOSE, SCALE = ROOT / "docker" / "compose.yaml", ROOT / "docker" / "compose.scale.yaml"
 ADMIN_TOKEN = "admin-of-the-proxy-test"
 SITE = "127.0.0.1"
 needs_caddy = pytest.mark.skipif(shutil.which("caddy") is None, reason="needs caddy (apt-get install caddy)")
@@ -158,3 +159,36 @@ def test_the_compose_file_names_what_is_there() -> None:
     asked = {word.partition("}")[0].partition(":")[0] for word in CADDYFILE.read_text().split("{$")[1:]}
     assert set(proxy["environment"]) <= asked
     assert "server:8750" in CADDYFILE.read_text()
+
+
+def test_the_compose_file_of_many_servers_names_what_is_there() -> None:
+    compose = yaml.safe_load(SCALE.read_text())
+    services = compose["services"]
+    servers = {name: each for name, each in services.items() if each["image"] == "cairn-server-scale"}
+    assert {name: each["environment"]["CAIRN_FOLDING"] for name, each in servers.items()} == {
+        "server-1": "elsewhere",
+        "server-2": "elsewhere",
+        "folder": "only",
+    }
+    for server in servers.values():
+        settings = {name.removeprefix("CAIRN_").lower() for name in server["environment"] if name.startswith("CAIRN_")}
+        assert settings <= set(Settings.model_fields)
+        assert server["cap_drop"] == ["ALL"] and server["read_only"]
+        one = yaml.safe_load(COMPOSE.read_text())["services"]["server"]
+        assert all(server[name] == one[name] for name in ("entrypoint", "mem_limit", "stop_grace_period"))
+        build = {**one["build"], "args": {**one["build"]["args"], "LOCK": "scale.lock"}}
+        assert server["build"] == build and "ARG LOCK=" in (SCALE.parent / "Dockerfile").read_text()
+    assert not any("ports" in each for name, each in services.items() if name != "proxy")
+    upstreams = services["proxy"]["environment"]["CAIRN_UPSTREAM"].split()
+    assert (
+        {place.partition(":")[0] for place in upstreams}
+        == {"server-1", "server-2"}
+        == set(services["proxy"]["depends_on"])
+    )
+    for service in services.values():
+        for place in service["volumes"]:
+            source = place.partition(":")[0]
+            assert source in {*compose["volumes"], "/data"} or source.startswith(("./Caddyfile", "${CAIRN_CERTS"))
+    Settings.model_validate(
+        {"store": servers["folder"]["environment"]["CAIRN_STORE"], "folding": "only"}
+    ).check_folding()

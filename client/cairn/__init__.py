@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from cairn_client.sync.scope import Scope
     from cairn_fusion.recording.recording import Recording, open_recording
     from cairn_fusion.recording.scan import Scan
+    from cairn_fusion.recording.scan_units import kelvin_from_celsius
     from cairn_map.codec.cell_code import Profile
     from cairn_map.errors import (
         BadInputError,
@@ -77,6 +78,7 @@ __all__ = [
     "SyncFailed",
     "UnreachableError",
     "geometry_for",
+    "kelvin_from_celsius",
     "load_rig",
     "open_map",
     "open_recording",
@@ -93,6 +95,7 @@ _MODULES = {
     "cairn_client.sync.scope": "Scope",
     "cairn_fusion.recording.recording": "Recording open_recording",
     "cairn_fusion.recording.scan": "Scan",
+    "cairn_fusion.recording.scan_units": "kelvin_from_celsius",
     "cairn_map.codec.cell_code": "Profile",
     "cairn_map.errors": """
         CairnError BadInputError DeniedError NotFoundError ConflictError DamagedDataError UnreachableError

@@ -7,6 +7,7 @@ import numpy as np
 
 from cairn_calib.rig.camera import camera_from_field_of_view
 from cairn_calib.rig.rig import Rig, Spectrum, mount_camera
+from cairn_fusion.clouds.lzf_kernels import decompress_into
 from cairn_fusion.mapping.integrate import Integrator, Method, integrate_scan, integrate_scans
 from cairn_fusion.recording.scan import Scan
 from cairn_fusion.transfer.covariance_grid import CovarianceGrid
@@ -27,17 +28,20 @@ def warm_up() -> None:
     cameras = {name: mount_camera(spectrum, camera, beside) for name, spectrum in spectra.items()}
     rig = Rig(name="warm-up", cameras=cameras | {"tof": mount_camera(Spectrum.RANGE, camera, np.eye(4))})
     image = np.ones((2, 2), np.float32)
+    with_gap = image.copy()
+    with_gap[0, 0] = np.nan
     scan = Scan(
         time_s=0.0,
         T_map_rig=np.eye(4),
         range_camera="tof",
-        range_m=image,
+        range_m=with_gap,
         amplitude=np.ones((2, 2), np.uint16),
         colour={"colour": np.zeros((2, 2, 3), np.uint8)},
         thermal={"thermal": 300 * image},
     )
     integrate_scans([scan, scan], rig, Geometry(), integrator=Integrator(), threads=2)
     integrate_scan(scan, rig, Geometry(), integrator=Integrator(method=Method.CAST))
+    decompress_into(np.zeros(2, np.uint8), np.zeros(1, np.uint8))
     covariance = CovarianceGrid.of(rig, src="tof", dst="colour")
     covariance.at(np.zeros((1, 2)), np.ones(1, np.float32), np.ones(1, np.float32))
     if find_spec("cv2") is not None:

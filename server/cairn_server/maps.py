@@ -5,42 +5,61 @@ all branches, and no further back than `LAG_ENTRIES_MAX`: a branch older than th
 entries and an unknown number of bytes; it would fetch whole cells in any case.
 """
 
+import logging
 import time
 from bisect import bisect_right
 from collections import defaultdict
 from itertools import accumulate
 
 from cairn_map.commits.cursor import Cursor
-from cairn_map.commits.ids import INITIAL, OPERATOR, RobotName, robot_name
+from cairn_map.commits.ids import robot_name
 from cairn_map.errors import BadInputError
 from cairn_map.wire.live_events import RobotSign
 from cairn_map.wire.messages import BranchInfo, CreateMap, MapInfo, Register, Registered
-from cairn_server.access.auth import new_token, token_hash
+from cairn_server.access.auth import check_robot_name, new_token, token_hash
+from cairn_server.cell_room import check_geometry
 from cairn_server.live.hub import Hub
 from cairn_server.live.live_map import LiveRobots
 from cairn_server.live.robot_reports import RobotReports
+from cairn_server.memory_shares import MemoryShares
 from cairn_server.store.admission import OWN_WORD, Grounds
 from cairn_server.store.store import Store
 from cairn_server.store.store_rows import Branch, EntrySize, MapRow
 from cairn_server.sync.handing_over import server_key
 
+log = logging.getLogger(__name__)
+
 LAG_ENTRIES_MAX = 10_000
-RESERVED_NAMES = frozenset({OPERATOR, INITIAL, RobotName("main")})
-"""Names that no robot may register under."""
 
 
 class Maps:
     """Maps of a store and the robots registered on them; called from many threads."""
 
-    def __init__(self, store: Store, hub: Hub, reports: RobotReports) -> None:
+    def __init__(self, store: Store, hub: Hub, reports: RobotReports, shares: MemoryShares) -> None:
         self._store = store
+        self._shares = shares
         self._hub = hub
         self._reports = reports
 
     def create(self, name: str, request: CreateMap) -> tuple[MapInfo, bool]:
-        """Create a map unless an equal one exists; its facts, and whether it is new."""
+        """Create a map unless an equal one exists; its facts, and whether it is new.
+
+        Raises:
+            BadInputError: kind `cell_too_large`: one full cell would take more memory than this server has for it.
+            ConflictError: kind `map_exists`: another geometry or sensor model.
+        """
+        if all(row.name != name for row in self._store.maps()):
+            check_geometry(request.geometry, self._shares)
         row, is_new = self._store.create_map(robot_name(name), request.geometry, request.sensor_model)
         return self.info(row), is_new
+
+    def warn_of_large_cells(self) -> None:
+        """Log each map that was made while this server had more memory for a cell."""
+        for row in self._store.maps():
+            try:
+                check_geometry(row.geometry, self._shares)
+            except BadInputError as exc:
+                log.warning("map %s may take more memory than memory_bytes: %s", row.name, exc.message)
 
     def info(self, row: MapRow) -> MapInfo:
         """Extent, sizes and head of a map."""
@@ -58,7 +77,7 @@ class Maps:
             name=row.name,
             geometry=row.geometry,
             sensor_model=row.sensor_model,
-            cursor=str(head.cursor),
+            cursor=str(head),
             cells=totals.cells,
             size_bytes=totals.size_bytes,
             commits=totals.commits,
@@ -74,10 +93,7 @@ class Maps:
             BadInputError: kind `reserved_name`.
             DeniedError: kind `not_admitted`: the name is bound to another key.
         """
-        if request.robot in RESERVED_NAMES:
-            raise BadInputError(
-                "reserved_name", f"{request.robot} is not a robot's name; reserved are operator, initial, main"
-            )
+        check_robot_name(request.robot)
         token = new_token()
         branch = Branch(request.robot, request.mode, tuple(request.sensors), None, time.time(), request.incarnation)
         self._store.register(row, branch, token_hash(token), grounds)
@@ -96,13 +112,13 @@ class Maps:
 
     def branches(self, row: MapRow) -> list[BranchInfo]:
         """All robots of a map by name, and how far each is behind the head."""
-        return _branch_infos(self._store, row, self._hub.robots(row))
+        return _branch_infos(self._store, row, self._hub.present_robots(row))
 
 
 def _branch_infos(store: Store, row: MapRow, robots: LiveRobots) -> list[BranchInfo]:
     """All branches by name, each with its last sign of life."""
     with store.snapshot(row) as snapshot:
-        head = snapshot.head.cursor
+        head = snapshot.head
     branches = store.branches(row)
     starts = [cursor.seq for branch in branches if (cursor := _of_log(branch.cursor, head)) and cursor.seq < head.seq]
     after = max(min(starts, default=head.seq), head.seq - LAG_ENTRIES_MAX)

@@ -2,11 +2,13 @@
 
     limit = programs + decoding + folding + bodies + checks + caches
 
-Programs, decoding and folding are what one cell of 256^3 voxels takes, however small the machine; bodies, checks and
-caches grow with the limit. What would not fit is refused at the door, or waits: caches forget, a request waits for
-room to decode or is answered 503, a commit whose check needs more than its share is refused as `too_costly`.
+Decoding and folding have what one full cell of the standard geometry takes, however small the machine, and three
+tenths of a larger limit; bodies, checks and caches grow with the limit, too. What would not fit is refused at the door,
+or waits: a map of larger cells is not made (`cell_too_large`), caches forget, a request waits for room to decode or is
+answered 503, folding waits, a commit whose check needs more than its share is refused as `too_costly`.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 from cairn_map.errors import BadInputError
@@ -16,10 +18,15 @@ MIB = 1 << 20
 PROGRAMS_BYTES = 512 * MIB
 """Memory of the programs themselves, kernels and libraries included: four processes, 170 MB at rest and 330 to 450 MB
 under load (PSS; docs/decisions/022-memory-as-one-sum.md)."""
-DECODING_BYTES = 256 * MIB
-"""Memory for cells that requests decode at the same time (`folding.decoding_room`)."""
-FOLDING_BYTES = 384 * MIB
-"""Memory for the diffs that are folded at the same time, one in each lane: two of 2^24 voxels, the largest."""
+DECODING_MIN_BYTES = 588 * MIB
+"""Least memory for cells that requests decode at the same time (`cell_room`)."""
+FOLDING_MIN_BYTES = 832 * MIB
+"""Least memory for cells that are folded at the same time, and for encoded ones on their way to the store."""
+SPOOL_BYTES = 8 * MIB
+"""Memory for the encoded cells of one fold (`store.row_spool`)."""
+CELLS_MIN_BYTES = DECODING_MIN_BYTES + FOLDING_MIN_BYTES
+CELLS_TENTHS = 3
+"""Tenths of the limit that decoding and folding have together, if that is more."""
 BODIES_MIN_BYTES, BODIES_MAX_BYTES = 128 * MIB, 256 * MIB
 """Memory for bodies on their way: one token may fill half, and a commit has 2^26 bytes."""
 CHECKS_MIN_BYTES, CHECK_MAX_BYTES = 384 * MIB, 1536 * MIB
@@ -29,12 +36,10 @@ TWO_WORKERS_BYTES = 1024 * MIB
 CACHES_MIN_BYTES = 64 * MIB
 CACHES_BYTES = 1200 * MIB
 """Sum of the standard sizes of all caches: cells under change, cells read, their changes, pictures' cells and lists."""
-GROWING_PART = 16
+GROWING_PART = 20
 """Bodies get one part in so many of the limit."""
-LIMIT_MIN_BYTES = (
-    PROGRAMS_BYTES + DECODING_BYTES + FOLDING_BYTES + BODIES_MIN_BYTES + CHECKS_MIN_BYTES + CACHES_MIN_BYTES
-)
-"""Smallest limit: 1.81 GB."""
+LIMIT_MIN_BYTES = PROGRAMS_BYTES + CELLS_MIN_BYTES + BODIES_MIN_BYTES + CHECKS_MIN_BYTES + CACHES_MIN_BYTES
+"""Smallest limit: 2.63 GB."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +47,8 @@ class MemoryShares:
     """Memory of each part, bytes; together at most the limit."""
 
     limit_bytes: int
+    decoding_bytes: int
+    folding_bytes: int
     bodies_bytes: int
     check_workers: int
     check_bytes: int
@@ -52,8 +59,8 @@ class MemoryShares:
     def sum_bytes(self) -> int:
         """Memory of all parts together."""
         checks_bytes = self.check_workers * self.check_bytes
-        fixed_bytes = PROGRAMS_BYTES + DECODING_BYTES + FOLDING_BYTES
-        return fixed_bytes + self.bodies_bytes + checks_bytes + self.caches_bytes
+        cells_bytes = self.decoding_bytes + self.folding_bytes
+        return PROGRAMS_BYTES + cells_bytes + self.bodies_bytes + checks_bytes + self.caches_bytes
 
     @property
     def cache_share(self) -> float:
@@ -88,8 +95,9 @@ class MemoryShares:
         least = " (the least that it needs)" if self.limit_bytes == LIMIT_MIN_BYTES else ""
         return (
             f"memory: at most {self.limit_bytes / 1e6:.0f} MB in all{least}: caches {self.caches_bytes / 1e6:.0f}, "
-            f"checks {self.check_workers} x {self.check_bytes / 1e6:.0f}, folding {FOLDING_BYTES / 1e6:.0f}, decoding "
-            f"{DECODING_BYTES / 1e6:.0f}, bodies {self.bodies_bytes / 1e6:.0f}, programs {PROGRAMS_BYTES / 1e6:.0f}"
+            f"checks {self.check_workers} x {self.check_bytes / 1e6:.0f}, folding {self.folding_bytes / 1e6:.0f}, "
+            f"decoding {self.decoding_bytes / 1e6:.0f}, bodies {self.bodies_bytes / 1e6:.0f}, "
+            f"programs {PROGRAMS_BYTES / 1e6:.0f}"
         )
 
 
@@ -111,14 +119,32 @@ def memory_shares(limit_bytes: int | None = None) -> MemoryShares:
     if limit_bytes < LIMIT_MIN_BYTES:
         raise BadInputError(
             "bad_setting",
-            f"memory_bytes is {limit_bytes}; the server's processes need {LIMIT_MIN_BYTES} at least: one cell of 256^3 "
-            "voxels is decoded, folded and checked at the same time",
+            f"memory_bytes is {limit_bytes}; the server's processes need {LIMIT_MIN_BYTES} at least: one full "
+            "cell is decoded, folded and checked at the same time",
         )
     bodies_bytes = min(max(limit_bytes // GROWING_PART, BODIES_MIN_BYTES), BODIES_MAX_BYTES)
+    cells_bytes = max(CELLS_MIN_BYTES, limit_bytes * CELLS_TENTHS // 10)
+    decoding_bytes = cells_bytes * DECODING_MIN_BYTES // CELLS_MIN_BYTES
     # Caches and checks share the rest; what checks cannot use, caches may.
-    rest_bytes = limit_bytes - PROGRAMS_BYTES - DECODING_BYTES - FOLDING_BYTES - bodies_bytes
+    rest_bytes = limit_bytes - PROGRAMS_BYTES - cells_bytes - bodies_bytes
     checks_bytes = max(rest_bytes // 2, CHECKS_MIN_BYTES)
     workers = 2 if checks_bytes >= TWO_WORKERS_BYTES else 1
     check_bytes = min(checks_bytes // workers, CHECK_MAX_BYTES)
     caches_bytes = min(rest_bytes - workers * check_bytes, CACHES_BYTES)
-    return MemoryShares(limit_bytes, bodies_bytes, workers, check_bytes, caches_bytes)
+    return MemoryShares(
+        limit_bytes,
+        decoding_bytes,
+        cells_bytes - decoding_bytes,
+        bodies_bytes,
+        workers,
+        check_bytes,
+        caches_bytes,
+    )
+
+
+def limit_for_cells(decoding_bytes: int, folding_bytes: int) -> int:
+    """Least limit above the smallest one of which decoding and folding have at least so much."""
+    cells_bytes = max(
+        decoding_bytes * CELLS_MIN_BYTES / DECODING_MIN_BYTES, folding_bytes * CELLS_MIN_BYTES / FOLDING_MIN_BYTES
+    )
+    return math.ceil(cells_bytes * 10 / CELLS_TENTHS) + 10

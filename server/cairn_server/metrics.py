@@ -120,7 +120,8 @@ def store_metrics(found: StoreFigures, backlogs: list[Backlog]) -> Iterator[Metr
     """Sizes, writes and backlogs of the store."""
     yield GaugeMetricFamily("cairn_store_size_bytes", "Size of the store at rest.", found.size_bytes)
     yield GaugeMetricFamily("cairn_wal_size_bytes", "Size of what the store wrote ahead.", found.ahead_bytes)
-    yield GaugeMetricFamily("cairn_disk_free_bytes", "Free space on the store's disk.", found.free_bytes)
+    if found.free_bytes is not None:
+        yield GaugeMetricFamily("cairn_disk_free_bytes", "Free space on the store's disk.", found.free_bytes)
     yield GaugeMetricFamily("cairn_writer_queue_length", "Jobs that wait to be written.", found.queued)
     yield CounterMetricFamily("cairn_writer_transactions_total", "Transactions made durable.", found.written)
     yield CounterMetricFamily(

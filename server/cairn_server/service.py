@@ -14,13 +14,16 @@ from dataclasses import dataclass
 from itertools import chain
 
 from cairn_server.access.cancellation import StopTime
-from cairn_server.folding.cell_cache import CACHE_BYTES
+from cairn_server.access.rate_limits import ActLimit
+from cairn_server.cell_room import DECODING
 from cairn_server.folding.cells import Cells
 from cairn_server.folding.damaged_cells import DamagedCells
+from cairn_server.folding.fold_memory import FoldMemory
 from cairn_server.folding.fold_process import FoldProcess
 from cairn_server.folding.fold_thread import FoldThread
 from cairn_server.folding.readiness import FoldHealth, Readiness
 from cairn_server.live.hub import Hub
+from cairn_server.live.replica_watch import ReplicaWatch
 from cairn_server.live.robot_reports import RobotReports
 from cairn_server.maps import Maps
 from cairn_server.metrics import (
@@ -33,6 +36,7 @@ from cairn_server.metrics import (
     upstream_metrics,
 )
 from cairn_server.settings import Settings
+from cairn_server.store.row_spool import remove_spools
 from cairn_server.store.store import Store
 from cairn_server.sync.admissions import Admissions
 from cairn_server.sync.handing_over import UpstreamProgress
@@ -77,29 +81,37 @@ class Service:
     """Parts of a map server on one store, made and ended together."""
 
     def __init__(self, store: Store, settings: Settings, *, fold_process: FoldProcess | None = None) -> None:
-        """Start the parts; without `fold_process` the service's own thread folds."""
+        """Start the parts; without `fold_process` the service's own thread folds, if it is to fold at all."""
         self.store = store
         self.settings = settings
         self.figures = ServerFigures()
         self.stop_time = StopTime()
+        shared_uses = store.replicas.uses if store.replicas is not None else None
+        self.acts = ActLimit(settings.quotas.acts_per_hour, shared=shared_uses)
         self.live = Hub(store, connections=settings.limit_concurrency)
         self.reports = RobotReports(store, self.live)
-        self.maps = Maps(store, self.live, self.reports)
+        self.watch = ReplicaWatch(store, self.live, self.reports) if store.replicas is not None else None
+        self.maps = Maps(store, self.live, self.reports, settings.memory)
+        self.maps.warn_of_large_cells()
 
-        upstream = UpstreamProgress(store.age, is_joined=settings.upstream is not None)
+        DECODING.limit_bytes = settings.memory.decoding_bytes
+        remove_spools(settings.folder)
+        upstream = UpstreamProgress(store.age, settings.upstream, store.replicas)
         damaged, folds = DamagedCells(), FoldHealth(self.figures)
-        self._fold_thread = FoldThread(
-            store,
-            folds,
-            damaged,
-            keep_evidence_s=settings.keep_evidence_s,
-            on_fold=self.live.folded,
-            may_forget_s=upstream.may_forget_s,
-            process=fold_process,
-            cells_bytes=int(settings.memory.cache_share * CACHE_BYTES),
-        )
-        self.readiness = Readiness(store.health, folds, settings, self._fold_thread.is_alive)
-        self.cells = Cells(store, damaged, on_heal=self._fold_thread.wake)
+        self._fold_thread: FoldThread | None = None
+        if settings.folding != "elsewhere":
+            self._fold_thread = FoldThread(
+                store,
+                folds,
+                damaged,
+                keep_evidence_s=settings.keep_evidence_s,
+                on_fold=self.live.folded,
+                may_forget_s=upstream.may_forget_s,
+                process=fold_process,
+                memory=FoldMemory.of_server(settings.memory, settings.folder),
+            )
+        self.readiness = Readiness(store.health, folds, settings, self._is_folding)
+        self.cells = Cells(store, damaged, on_heal=self._wake_folding)
 
         self.sync = self._sync_parts(upstream)
         exports = MapExports(store, self.cells)
@@ -114,12 +126,11 @@ class Service:
         store, settings, wanted = self.store, self.settings, WantedCommits()
 
         def on_new() -> None:
-            self._fold_thread.wake()
+            self._wake_folding()
             upstream.wake()
 
         admissions = Admissions(store, settings.quotas)
         pushes = Pushes(store, settings, self.live, wanted, admissions, on_new=on_new)
-        stable = StableVectors(store.age, settings.stable_after_s)
         return SyncParts(
             admissions,
             pushes,
@@ -131,12 +142,20 @@ class Service:
                 self.live,
                 wanted,
                 self.figures,
-                stable=stable,
+                stable=StableVectors(store.age, settings.stable_after_s),
                 cache_share=settings.memory.cache_share,
             ),
             HeldCommits(store, wanted),
             upstream,
         )
+
+    def _wake_folding(self) -> None:
+        if self._fold_thread is not None:
+            self._fold_thread.wake()
+
+    def _is_folding(self) -> bool:
+        """True unless what came is to be folded here, and cannot."""
+        return self._fold_thread is None or self._fold_thread.is_alive()
 
     def metrics_text(self) -> str:
         """All metrics for Prometheus."""
@@ -157,6 +176,9 @@ class Service:
         self.stop_streams()
         self.sync.pushes.close()
         self.views.tickets.close()
-        self._fold_thread.close()
+        if self._fold_thread is not None:
+            self._fold_thread.close()
+        if self.watch is not None:
+            self.watch.close()
         self.reports.close()
         self.store.close()

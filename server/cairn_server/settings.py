@@ -6,7 +6,8 @@ The sentence below a field is also its help in `cairn serve --help`; the flags, 
 
 from ipaddress import ip_network
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
+from urllib.parse import urlsplit, urlunsplit
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
@@ -24,6 +25,12 @@ def _none_if_zero(value: Any) -> Any:
 def _networks(value: str) -> str:
     for part in value.split():
         ip_network(part)
+    return value
+
+
+def _database(value: str) -> str:
+    if not value.startswith(("postgresql://", "postgres://")):
+        raise ValueError("expected a URL like postgresql://USER@HOST/NAME; without one SQLite keeps the maps")
     return value
 
 
@@ -56,6 +63,9 @@ class Quotas(BaseModel):
     who merge them that nothing was sent for. Sweeps and images send 2.7 bytes and more for each brick."""
     registrations_per_hour: Count = 600
     """Robots that one enrolment token may register in an hour, all at once or one by one."""
+    acts_per_hour: Count = 1000
+    """Keys that one operator's token may admit in an hour, and retracts that it may make, together: each is a line of
+    the audit log, of which the newest are kept."""
     cells_per_commit: Count = None
     """Cells that one commit may touch; FORMAT.md allows 4096 in any case."""
     map_extent_m: Metres = 100_000.0
@@ -69,7 +79,13 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     folder: Path = Path("cairn-data")
-    """Folder of the store; made if missing."""
+    """Folder of the store, and of files on their way; made if missing."""
+    store: Annotated[str, AfterValidator(_database)] | None = None
+    """URL of a PostgreSQL database to keep the maps in, which any number of servers may share
+    (postgresql://USER@HOST/NAME; its password in the file that PGPASSFILE names); default: SQLite in the folder."""
+    folding: Literal["here", "elsewhere", "only"] = "here"
+    """Server that brings what came into the maps of a shared store: here; elsewhere: another one; only: this process
+    does nothing else, and answers probes and metrics alone."""
     host: str = "127.0.0.1"
     """Address to listen on."""
     port: Annotated[int, Field(ge=0, le=65535)] = 8750
@@ -124,10 +140,10 @@ class Settings(BaseModel):
     """Seconds that a commit may wait to be folded while the server counts as ready."""
     memory_bytes: Annotated[int, Field(ge=1)] | None = None
     """Memory of all processes of the server together, bytes, divided among its parts as it says at the start. Default:
-    a quarter of the memory of the machine, or of its container; at least 1.81 GB."""
+    a quarter of the memory of the machine, or of its container; at least 2.63 GB."""
     body_memory_bytes: Annotated[int, Field(ge=1 << 20)] | None = None
     """Memory for bodies of requests on their way, bytes; beyond it they are answered 503. One token may fill half; a
-    commit has up to 2^26 bytes. Default: a share of memory_bytes, 2^28 from 4.3 GB on."""
+    commit has up to 2^26 bytes. Default: a share of memory_bytes, 2^28 from 5.4 GB on."""
     check_workers: Annotated[int, Field(ge=1)] | None = None
     """Processes that check expensive commits, started when the first one comes. Default: 2, or 1 if memory_bytes is
     small."""
@@ -148,6 +164,27 @@ class Settings(BaseModel):
         return shares.with_parts(
             bodies_bytes=self.body_memory_bytes, check_workers=self.check_workers, check_bytes=self.check_memory_bytes
         )
+
+    @property
+    def place(self) -> str:
+        """Place of the maps, for people: without a password."""
+        if self.store is None:
+            return str(self.folder)
+        found = urlsplit(self.store)
+        return urlunsplit(found._replace(netloc=found.netloc.rpartition("@")[2], query=""))
+
+    def check_folding(self) -> None:
+        """Refuse a role that needs other servers where there can be none.
+
+        Raises:
+            BadInputError: kind `bad_setting`.
+        """
+        if self.folding != "here" and self.store is None:
+            raise BadInputError(
+                "bad_setting",
+                "--no-fold and --fold-only are for servers that share a database (--store postgresql://...); SQLite is "
+                "one process's",
+            )
 
     def check_tls(self) -> None:
         """Refuse a certificate without its key, and a key without its certificate.

@@ -26,19 +26,24 @@ from tests.bench.coding import coding_rows
 from tests.bench.console import console_rows
 from tests.bench.imports import import_rows
 from tests.bench.integration import integration_rows
+from tests.bench.large_map import large_map_rows
 from tests.bench.links import link_rows
 from tests.bench.overlay import overlay_rows
 from tests.bench.peers import peer_rows
 from tests.bench.queries import query_rows
+from tests.bench.scale import scale_rows
 from tests.bench.server import server_rows
 from tests.bench.simulation import simulation_rows
 from tests.bench.start import start_rows
+from tests.bench.surfaces import surface_rows
 from tests.bench.telepresence import telepresence_rows
 
 from cairn_client.http.api import MapApi
 from cairn_client.robot.robot import Robot
 from cairn_fusion.importers import open_source
+from cairn_fusion.mapping.grouping import Grouping, OpenGroup
 from cairn_fusion.mapping.measurement import Measurement
+from cairn_fusion.recording.recording import ScanSource
 from cairn_fusion.recording.scan import Scan
 from cairn_map.codec.cell_code import decode_canonical_cell, encode_cell
 from cairn_map.commits.commit import CommitMeta, make_commit
@@ -188,18 +193,30 @@ def _recording_rows(smoke: bool) -> Iterator[Row]:
         source = open_source(Path(root) / name)
         geometry = geometry_for(voxel_edge_m=voxel_m, channels=channels)
         count = 3 if smoke else len(source)
-        with tempfile.TemporaryDirectory() as folder, _server(Path(folder) / "server") as url:
-            MapApi(url).create_map("bench", CreateMap(geometry=geometry))
-            with Robot(source.rig, f"{url}/maps/bench", directory=Path(folder) / "robot", name="bench") as robot:
-                robot.sync()
-                start = time.perf_counter()
-                for index in range(count):
-                    robot.observe(source.scan(index))
+        seconds, size_bytes = _replayed(source, geometry, count, Grouping(scans_max=1))
+        yield f"replay {name}, {voxel_m * 100:g} cm", f"{count / seconds:.1f}", "images/s, read, mapped, pushed"
+        yield "  bytes pushed per measurement (1 image)", f"{size_bytes / count:.0f}", "B"
+        grouping = Grouping() if source.has_times else Grouping(seconds_max=None)
+        seconds, size_bytes = _replayed(source, geometry, count, grouping)
+        yield "  bytes pushed per 1000 images, standard groups", f"{size_bytes / count / 1000:.2f}", "MB"
+
+
+def _replayed(source: ScanSource, geometry: Geometry, count: int, grouping: Grouping) -> tuple[float, int]:
+    """Seconds to read, map and push some scans of a source, and the bytes pushed."""
+    group = OpenGroup(grouping)
+    with tempfile.TemporaryDirectory() as folder, _server(Path(folder) / "server") as url:
+        MapApi(url).create_map("bench", CreateMap(geometry=geometry))
+        with Robot(source.rig, f"{url}/maps/bench", directory=Path(folder) / "robot", name="bench") as robot:
+            robot.sync()
+            start = time.perf_counter()
+            for index in range(count):
+                scan = source.scan(index)
+                if group.ends_before(scan.time_s, scan.T_map_rig):
                     robot.commit()
-                robot.sync()
-                seconds = time.perf_counter() - start
-                yield f"replay {name}, {voxel_m * 100:g} cm", f"{count / seconds:.1f}", "images/s, read, mapped, pushed"
-                yield "  bytes pushed per measurement (1 image)", f"{robot.traffic.up_bytes / count:.0f}", "B"
+                robot.observe(scan)
+            robot.commit()
+            robot.sync()
+            return time.perf_counter() - start, robot.traffic.up_bytes
 
 
 def _size_rows(smoke: bool) -> Iterator[Row]:
@@ -243,9 +260,12 @@ PARTS: dict[str, Callable[[bool], Iterator[Row]]] = {
     "overlay": overlay_rows,
     "peers": peer_rows,
     "queries": query_rows,
+    "scale": scale_rows,
     "server": server_rows,
+    "large-map": large_map_rows,
     "simulation": simulation_rows,
     "start": start_rows,
+    "surfaces": surface_rows,
     "telepresence": telepresence_rows,
     "recordings": _recording_rows,
     "sizes": _size_rows,

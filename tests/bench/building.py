@@ -10,9 +10,10 @@ from pathlib import Path
 
 from cairn_client.http.api import MapApi
 from cairn_map.codec.cell_code import encode_cell
-from cairn_map.evidence.grid import cell_of_key, geometry_for
+from cairn_map.evidence.grid import cell_of_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.files.cell_folder import FolderHead, write_cell, write_head
+from cairn_sim.experiment.figures import paper_geometry
 from cairn_sim.experiment.mapping import GrowingMap, map_all
 from cairn_sim.experiment.robots import simulated_robots
 from cairn_sim.robots.robots import ROBOTS
@@ -30,7 +31,7 @@ def building_map(inside: Path, cm: int, *, stops: int | None) -> Path:
     robots = simulated_robots(
         load_scene("building"), ROBOTS["orpheus"], scale=0.25, seed=0, stops=stops, threads=THREADS
     )
-    growing = GrowingMap(geometry_for(voxel_edge_m=cm / 100))
+    growing = GrowingMap(paper_geometry(cm / 100))
     for _ in map_all(robots, [growing], threads=THREADS):
         pass
     folder = inside / f"{cm}cm"

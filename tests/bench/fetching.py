@@ -61,7 +61,7 @@ def _folded(store: SqliteStore, row: MapRow, bodies: Bodies, first: int, more: i
         if n >= first - 1:
             fold_pending(store, row, cache, limit=first)
             with store.snapshot(row) as snapshot:
-                cursors.append(snapshot.head.cursor)
+                cursors.append(snapshot.head)
     return cursors
 
 

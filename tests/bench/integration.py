@@ -3,13 +3,20 @@
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import numpy.typing as npt
 from tests.bench.timing import cpu_s, wall_s
 
-from cairn_calib.rig.rig import RangeSensing, Rig
+from cairn_calib.rig.lidar import SpinningLidar
+from cairn_calib.rig.rig import RangeSensing, Rig, Spectrum, mount_camera
+from cairn_fusion.clouds.sweep_image import T_LIDAR_CAMERA
 from cairn_fusion.mapping.integrate import Integrator, Method, integrate_scans
+from cairn_fusion.mapping.measurement import Measurement
+from cairn_fusion.recording.recording import Recording, open_recording
+from cairn_fusion.recording.recording_writer import RecordingWriter
 from cairn_fusion.recording.scan import Scan
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.evidence_map import EvidenceMap
@@ -54,6 +61,8 @@ def integration_rows(smoke: bool) -> Iterator[Row]:
             yield "  ray by ray", f"{1e3 * cast_s:.0f}", f"ms CPU, {cast_s / carve_s:.1f} x as long"
             one_s, two_s = (wall_s(work(geometry, Method.CARVE, n), 5) for n in (1, 2))
             yield "  2 threads", f"{1e3 * two_s:.0f}", f"ms wall, {one_s / two_s:.2f} x as fast"
+    yield from _sweep_rows(smoke)
+    yield from _rgbd_rows(smoke)
     if not smoke:
         yield from _all_cameras_rows(plan)
         yield from _truth_rows(plan, scans)
@@ -142,3 +151,47 @@ def _free_by_share(truth: Truth, diff: Diff, geometry: Geometry) -> npt.NDArray[
     """(4,) voxels called free that touch a solid, by how much of them is solid: the bounds of `SHARES`."""
     free = map_states(truth.box, diff, geometry, model=SensorModel()) == FREE
     return np.histogram(truth.solid_samples[free], [1, 8, 32, 64, 65])[0]
+
+
+def _sweep_rows(smoke: bool) -> Iterator[Row]:
+    """A sweep of 64 beams in a street 80 m long, as an image of known beams and as points without order."""
+    lidar = SpinningLidar(width=1938, height=64, elevations_deg=tuple(np.linspace(2.0, -24.8, 64).round(3).tolist()))
+    rays = lidar.rays() @ T_LIDAR_CAMERA[:3, :3].T
+    low_m, high_m = np.array([-78.0, -12.0, -1.8]), np.array([78.0, 12.0, 9.0])
+    with np.errstate(divide="ignore"):
+        range_m = (np.where(rays > 0, high_m, low_m) / rays).min(axis=-1).astype(np.float32)
+    rig = Rig(name="street", cameras={RANGE_CAMERA: mount_camera(Spectrum.RANGE, lidar, T_LIDAR_CAMERA)})
+    image = Scan(time_s=0.0, T_map_rig=np.eye(4), range_camera=RANGE_CAMERA, range_m=range_m)
+    points = (lidar.rays() * range_m[..., None]).reshape(-1, 3).astype(np.float32)
+    geometry, limits = geometry_for(voxel_edge_m=0.2, channels=()), Integrator(max_range_m=80.0)
+    for name, scan in (("image", image), ("points", replace(image, points_m=points))):
+        seconds = cpu_s(lambda scan=scan: integrate_scans([scan], rig, geometry, integrator=limits), 1 if smoke else 7)
+        yield f"sweep of 64 beams, {range_m.size} points, 80 m, 20 cm, {name}", f"{seconds:.2f}", "s CPU"
+
+
+def _rgbd_rows(smoke: bool) -> Iterator[Row]:
+    """RGB-D of 640 x 480 pixels from a hand-held camera, decoded from PNG and JPEG and mapped in one measurement."""
+    plan = Plan(scene=load_scene("small-room"), robot=ROBOTS["handheld"], path="west", scale=0.5, truth="none")
+    rig, count = plan.robot.rig_of(plan.scale), 2 if smoke else 12
+    with TemporaryDirectory() as folder:
+        with RecordingWriter(Path(folder) / "hand", rig, name="hand") as writer:
+            for _, scan, _ in scans_of(plan, shots_of(plan)[:count], rig):
+                writer.add(scan)
+        source = open_recording(Path(folder) / "hand")
+        height, width = source.scan(0).range_m.shape
+        for edge_m in (0.04,) if smoke else (0.04, 0.02):
+            measurement_s = cpu_s(
+                lambda edge_m=edge_m: _mapped(source, geometry_for(voxel_edge_m=edge_m)), 1 if smoke else 3
+            )
+            yield (
+                f"RGB-D {width} x {height} with colour, read and mapped, {edge_m * 100:g} cm",
+                f"{len(source) / measurement_s:.1f}",
+                "frames/s CPU",
+            )
+
+
+def _mapped(source: Recording, geometry: Geometry) -> Diff:
+    measurement = Measurement(source.rig, geometry)
+    for scan in source:
+        measurement.add(scan)
+    return measurement.diff()

@@ -83,6 +83,12 @@ def insert_scans(driver: Path, scans: Path, *, voxel_edge_m: float) -> OctomapRu
     return _run([str(driver), str(scans), str(voxel_edge_m), str(RANGE_MAX_M)])
 
 
+def voxel_states(driver: Path, scans: Path, out: Path, *, voxel_edge_m: float) -> npt.NDArray[np.int32]:
+    """(N, 4) numbers of the voxels that an `OcTree` of the scans knows, and 1 for occupied or -1 for free."""
+    _run([str(driver), str(scans), str(voxel_edge_m), str(RANGE_MAX_M), str(out)])
+    return np.fromfile(out, "<i4").reshape(-1, 4)
+
+
 def colour_tree(driver: Path, scans: Path, colours: Path, out: Path, *, voxel_edge_m: float) -> OctomapRun:
     """The same as a `ColorOcTree` with these colours, written to `out` (.ot)."""
     return _run([str(driver), str(scans), str(voxel_edge_m), str(RANGE_MAX_M), str(colours), str(out)])

@@ -13,7 +13,7 @@ import struct
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -114,8 +114,8 @@ class Robot:
 class Server:
     """`cairn serve` as a process of its own, with a map called bench."""
 
-    def __init__(self, folder: Path, geometry: Geometry) -> None:
-        command = [sys.executable, "-m", "cairn_client.main", "serve", "--data", str(folder), "--port", "0"]
+    def __init__(self, folder: Path, geometry: Geometry, *arguments: str) -> None:
+        command = [sys.executable, "-m", "cairn_client.main", "serve", "--data", str(folder), "--port", "0", *arguments]
         self._process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
         line = self._process.stdout.readline() if self._process.stdout else ""
         found = re.search(r":(\d+)", line.partition("http://")[2])
@@ -144,8 +144,7 @@ class Server:
 
     def cpu_s(self) -> float:
         """Processor time so far, of the server and the processes beside it."""
-        stats = [Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split() for pid in self._pids()]
-        return sum(int(fields[11]) + int(fields[12]) for fields in stats) / os.sysconf("SC_CLK_TCK")
+        return cpu_s_of(self._pids())
 
     def resident_bytes(self) -> int:
         """Memory at its highest so far, of each of them; what they share counts for each."""
@@ -153,8 +152,7 @@ class Server:
         return sum(int(size[1]) * 1024 for size in found if size)
 
     def _pids(self) -> list[int]:
-        tasks = Path(f"/proc/{self.pid}/task").glob("*/children")
-        return [self.pid, *(int(child) for path in tasks for child in path.read_text().split())]
+        return with_children(self.pid)
 
     def close(self) -> None:
         """Stop it."""
@@ -162,6 +160,18 @@ class Server:
         self._process.wait(timeout=60)
         if self._process.stdout:
             self._process.stdout.close()
+
+
+def with_children(pid: int) -> list[int]:
+    """A process and those that it started."""
+    tasks = Path(f"/proc/{pid}/task").glob("*/children")
+    return [pid, *(int(child) for path in tasks for child in path.read_text().split())]
+
+
+def cpu_s_of(pids: Iterable[int]) -> float:
+    """Processor time of processes so far, with that of their children that ended."""
+    stats = [Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split() for pid in pids]
+    return sum(sum(map(int, fields[11:15])) for fields in stats) / os.sysconf("SC_CLK_TCK")
 
 
 @contextmanager

@@ -45,7 +45,7 @@ def server_rows(smoke: bool) -> Iterator[Row]:
     layouts = (("tof", 0.08, 1.0), ("tof", 0.04, 1.0), ("orpheus", 0.04, 0.25))
     for robot, edge_m, scale in layouts[:1] if smoke else layouts:
         geometry = geometry_for(voxel_edge_m=edge_m)
-        diffs = _diffs(robot, geometry, scale=scale, scans=4 if smoke else 36)
+        diffs = scan_diffs(robot, geometry, scale=scale, scans=4 if smoke else 36)
         name = f"{robot}, {edge_m * 100:g} cm"
         yield from _push_rows(name, diffs, geometry, seconds=1.0 if smoke else 30.0)
         if robot == "tof":
@@ -53,11 +53,11 @@ def server_rows(smoke: bool) -> Iterator[Row]:
     yield from _visible_rows(diffs, geometry, pushes=10 if smoke else 200)
     yield from _bomb_rows(diffs[0], geometry)
     fine = geometry_for(voxel_edge_m=0.02)
-    yield from fold_lag_rows(_diffs("tof", fine, scale=1.0, scans=2 if smoke else 36), fine, smoke=smoke)
+    yield from fold_lag_rows(scan_diffs("tof", fine, scale=1.0, scans=2 if smoke else 36), fine, smoke=smoke)
     yield from fetching_rows(diffs, geometry, smoke)
 
 
-def _diffs(robot: str, geometry: Geometry, *, scale: float, scans: int) -> list[Diff]:
+def scan_diffs(robot: str, geometry: Geometry, *, scale: float, scans: int) -> list[Diff]:
     """What single scans of two stops say."""
     plan = Plan(
         scene=load_scene("building"),

@@ -9,6 +9,8 @@ from importlib.metadata import version
 from pathlib import Path
 
 import pytest
+from tests.fixtures.client.robot_program import scan_of
+from tests.fixtures.client.robots import robot_in
 
 import cairn
 
@@ -77,3 +79,19 @@ def test_the_page_lists_exactly_the_names_of_the_door() -> None:
     rows = ROW.findall(PAGE)
     assert sorted(name for name, _, _ in rows) == cairn.__all__
     assert all(len(meaning) > 10 for _, meaning, _ in rows)
+
+
+def test_things_say_what_they_are_in_one_line(tmp_path: Path) -> None:
+    with robot_in(tmp_path) as robot:
+        scan = scan_of(1)
+        robot.observe(scan)
+        commit = robot.commit()
+        path = robot.snapshot().check_sphere([[0.5, 0.5, 0.5], [0.6, 0.5, 0.5]], radius_m=0.1)
+        said = [repr(thing) for thing in (robot, scan, commit, robot.map, robot.snapshot(), path)]
+    for text, begins in zip(
+        said,
+        ("Robot(mole on map lab", "Scan(1500000001", "Commit(mole.", "EvidenceMap(", "MapSnapshot(", "PathStates(2"),
+        strict=True,
+    ):
+        assert text.startswith(begins), text
+        assert len(text) < 160, text

@@ -206,9 +206,16 @@ def test_a_choice_of_no_frame_is_refused(tmp_path: Path, frames: list[str]) -> N
 
 def test_a_file_that_is_no_bag_is_not_called_a_folder_that_is_missing(tmp_path: Path) -> None:
     (tmp_path / "scan.pcd").write_text("VERSION 0.7")
-    with pytest.raises(BadInputError, match=r"scan\.pcd is a file") as refused:
+    with pytest.raises(BadInputError, match=r"scan\.pcd is one cloud of points") as refused:
         detect_layout(tmp_path / "scan.pcd")
     assert refused.value.kind == "unknown_layout"
+
+
+@pytest.mark.parametrize("name", ["drive.pcap", "drive.PCAPNG", "drive.osf"])
+def test_raw_packets_are_told_with_the_tool_that_makes_points_of_them(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(b"\xd4\xc3\xb2\xa1")
+    with pytest.raises(BadInputError, match="raw packets of a lidar: make points of them first"):
+        detect_layout(tmp_path / name)
 
 
 def test_rotations_that_are_off_by_rounding_are_mapped_and_told(folder: Path) -> None:

@@ -2,8 +2,9 @@
 
 from hypothesis import HealthCheck, settings
 from tests.fixtures.server.live import live
+from tests.fixtures.server.postgres import postgres, postgres_database
 
-__all__ = ["live"]
+__all__ = ["live", "postgres", "postgres_database"]
 
 settings.register_profile(
     "cairn", max_examples=50, deadline=None, database=None, suppress_health_check=[HealthCheck.too_slow]

@@ -1,5 +1,6 @@
 """`GET /metrics`: what is counted, and that it is the format that Prometheus reads."""
 
+import json
 import re
 import time
 from collections.abc import Iterator
@@ -42,6 +43,24 @@ def test_the_names_in_the_document_are_those_of_the_page(live: Live) -> None:
 def test_the_alarms_in_the_handbook_are_about_figures_that_there_are(live: Live) -> None:
     names = set(re.findall(r"cairn_[a-z_]+", (ROOT / "docs" / "administrator.md").read_text()))
     assert names - {"cairn_server"} <= set(families_of(text_of(live)))
+
+
+def test_the_dashboard_shows_figures_that_there_are_by_labels_that_they_have(live: Live) -> None:
+    row = live.new_map()
+    live.push(row, pushed(0, 0))
+    live.folded(row)
+    live.http.get("/nothing")
+    families = families_of(text_of(live))
+    dashboard = json.loads((ROOT / "docker" / "grafana-dashboard.json").read_text())
+    expressions = [target["expr"] for panel in dashboard["panels"] for target in panel.get("targets", ())]
+    assert len(expressions) > 15
+    for expression in expressions:
+        [shown] = re.findall(r"((?:cairn|process)_[a-z_]+)\{", expression)
+        family = families[shown.removesuffix("_bucket")]
+        labels = {name for _, sample in family.samples for name, _ in sample}
+        by = re.findall(r"by \(([a-z, ]+)\)", expression)
+        asked = {*re.findall(r"([a-z]+)=~?\"", expression), *", ".join(by).split(", ")} - {"", "instance"}
+        assert not family.samples or asked <= labels, expression
 
 
 def test_pushes_are_counted_by_outcome_with_their_bytes(fresh: Live) -> None:

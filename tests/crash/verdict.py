@@ -17,7 +17,9 @@ from cairn_map.commits.ids import CommitId, commit_id_from_text
 from cairn_map.errors import CairnError
 from cairn_server.folding.cell_cache import CellCache
 from cairn_server.folding.folding import fold_pending
+from cairn_server.store.history import head_of
 from cairn_server.store.sqlite.store import FILE_NAME, SqliteStore
+from cairn_server.store.store import Store
 from cairn_server.store.store_rows import MapRow, StoredCommit
 
 
@@ -58,7 +60,7 @@ def verdict_on(folder: Path, name: str, *, acked: Iterable[CommitId], offered: M
     try:
         rows = [row for row in store.maps() if row.name == name]
         if rows:
-            _compare(store, rows[0], expected, offered, found)
+            compare(store, rows[0], expected, offered, found)
         else:
             found.lost += expected
     except CairnError as exc:
@@ -78,15 +80,16 @@ def integrity(path: Path) -> list[str]:
         connection.close()
 
 
-def _compare(
-    store: SqliteStore, row: MapRow, acked: list[CommitId], offered: Mapping[CommitId, Commit], found: Verdict
+def compare(
+    store: Store, row: MapRow, acked: list[CommitId], offered: Mapping[CommitId, Commit], found: Verdict
 ) -> None:
+    """Compare a map with the commits that were acknowledged and offered; `found` gets what is wrong."""
     pending = store.pending(row, limit=100_000, size_bytes_max=1 << 40)
     with store.snapshot(row) as snapshot:
-        folded = list(snapshot.head.vector)
+        folded = list(head_of(snapshot).vector)
         entries = snapshot.log(after_seq=0, limit=1_000_000)
         chain = [snapshot.chain_at(n) for n in range(len(entries) + 1)]
-        head = snapshot.head.cursor
+        head = snapshot.head
     steps = [
         next_chain(before or b"", entry.kind.encode(), commit_id_from_text(entry.id), bytes.fromhex(entry.sha))
         for before, entry in zip(chain[:-1], entries, strict=True)
@@ -117,7 +120,7 @@ def _is_whole(stored: StoredCommit | None, commit: Commit) -> bool:
     )
 
 
-def cells_of(store: SqliteStore, row: MapRow) -> Cells:
+def cells_of(store: Store, row: MapRow) -> Cells:
     """The map's cells with evidence."""
     with store.snapshot(row) as snapshot:
         found = [snapshot.cell(cell.key) for cell in snapshot.cells() if cell.voxels]

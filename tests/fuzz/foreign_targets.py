@@ -10,6 +10,7 @@ from tests.fuzz.sections import in_folder, sections_of
 
 from cairn_calib.exchange.rig_exchange import FORMATS, format_of_text
 from cairn_calib.rig.lidar import SpinningLidar
+from cairn_fusion.clouds.sweep_image import sweep_image
 from cairn_fusion.ros.bag import Wire
 from cairn_fusion.ros.bag_recording import open_any_bag, survey
 from cairn_fusion.ros.images import amplitude_of, colour_of, depth_of, thermal_counts_of
@@ -29,7 +30,7 @@ from cairn_fusion.ros.messages import (
     read_transforms,
 )
 from cairn_fusion.ros.open_bag import is_bag
-from cairn_fusion.ros.point_clouds import elevations_of, read_points, sweep_image
+from cairn_fusion.ros.point_clouds import elevations_of, read_points
 from cairn_fusion.ros.topic_mapping import camera_of_info, mapping_of
 from cairn_map.errors import CairnError
 

@@ -15,6 +15,7 @@ from cairn_map.evidence.grid import CellKey, Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.store.admission import RobotKey
 from cairn_server.store.numbering import AGAIN_KEPT_S, EvidenceGoneError, Numbering, check_number
+from cairn_server.store.replica_notes import RobotView
 from cairn_server.store.shares import (
     ALARM_PART,
     RESERVE,
@@ -30,7 +31,6 @@ from cairn_server.store.store_rows import (
     ClosedRobot,
     Entry,
     Fold,
-    Head,
     MapRow,
     NewCommit,
     RobotShares,
@@ -87,7 +87,7 @@ class MemoryMap:
     """Everything about one map. Values are never changed, only put in place of others."""
 
     row: MapRow
-    head: Head
+    head: Cursor
     is_shared: bool = False
     """A snapshot has these dictionaries: copy them before they are changed."""
     commits: dict[CommitId, Kept] = field(default_factory=dict)
@@ -104,6 +104,9 @@ class MemoryMap:
     cells: dict[CellKey, CellRow] = field(default_factory=dict)
     branches: dict[str, Branch] = field(default_factory=dict)
     statuses: dict[str, str] = field(default_factory=dict)
+    heard_s: dict[str, float] = field(default_factory=dict)
+    """Times at which statuses were heard, where several servers note them."""
+    views: dict[str, RobotView] = field(default_factory=dict)
     keys: dict[Author, RobotKey] = field(default_factory=dict)
     """That names are bound to."""
 
@@ -137,17 +140,24 @@ class MemoryMap:
         self.ids.append(commit.id)
         return True
 
+    def has_evidence(self, before_s: float) -> bool:
+        """True if evidence is kept of a commit that was folded before an age of the store."""
+        return any(
+            kept.cells and not kept.is_gone and kept.folded_seq is not None and kept.folded_age_s < before_s
+            for kept in self.commits.values()
+        )
+
     def next_number(self, author: Author) -> int:
         """The number after an author's highest."""
         return self.authors[author][0] + 1 if author in self.authors else 0
 
     def fold(self, fold: Fold, *, age_s: float) -> bool:
         """Cells, entries and head at an age of the store, if head and retracts are still where the fold begins."""
-        if fold.base != self.head.cursor:
+        if fold.base != self.head:
             return False
         if any(self.commits[self.ids[step.commit]].due_from != step.before for step in fold.steps):
             return False
-        self.head = Head(cursor=fold.head, vector=fold.vector)
+        self.head = fold.head
         for entry in fold.entries:
             self.entries.append(entry)
             self._note_entry(entry, len(self.entries), age_s)
@@ -324,5 +334,4 @@ def new_memory_map(number: int, name: str, geometry: Geometry, sensor_model: Sen
         number=number, name=name, geometry=geometry, sensor_model=sensor_model, seal_key=secrets.token_bytes(32)
     )
     log_id = secrets.token_bytes(16)
-    head = Head(cursor=Cursor(log_id, 0, first_chain(log_id, geometry.digest())))
-    return MemoryMap(row, head)
+    return MemoryMap(row, Cursor(log_id, 0, first_chain(log_id, geometry.digest())))

@@ -7,23 +7,23 @@ from itertools import islice
 
 from tests.memory_store.map import Kept, MemoryMap
 
-from cairn_map.commits.cursor import ENTRY_FOLD, first_chain
+from cairn_map.commits.cursor import ENTRY_FOLD, Cursor, first_chain
 from cairn_map.commits.ids import Author, CommitId
 from cairn_map.commits.version_vector import EMPTY, VersionVector
+from cairn_map.evidence.fingerprint import ZERO, Fingerprint
 from cairn_map.evidence.grid import CellKey, cell_of_key
 from cairn_map.wire.messages import LogEntry
 from cairn_server.store.store_rows import (
     CAPTURED_AHEAD_MAX_S,
     CellRow,
-    CellState,
     ChainedEntry,
     Contribution,
     Entry,
-    Head,
     NamedCommit,
     Selection,
     Totals,
 )
+from cairn_server.store.tiles import Box
 
 
 class MemorySnapshot:
@@ -33,35 +33,41 @@ class MemorySnapshot:
         self._state = state
 
     @property
-    def head(self) -> Head:
+    def head(self) -> Cursor:
         """The state."""
         return self._state.head
 
     def chain_at(self, seq: int) -> bytes | None:
         """The chain after entry `seq` (0: of the empty log); None if there is no such entry."""
         if seq == 0:
-            return first_chain(self.head.cursor.log_id, self._state.row.geometry.digest())
+            return first_chain(self.head.log_id, self._state.row.geometry.digest())
         return self._state.entries[seq - 1].chain if 0 < seq <= len(self._state.entries) else None
 
     def cell(self, key: CellKey) -> CellRow | None:
         """One cell with its body."""
         return self._state.cells.get(key)
 
-    def cells(self, *, after_seq: int = -1, after_key: int = -1, limit: int | None = None) -> Iterator[CellRow]:
-        """Cells changed after a log entry, of numbers above `after_key`, at most `limit`; without bodies, rising."""
+    def cells(
+        self, *, after_seq: int = -1, after_key: int = -1, limit: int | None = None, box: Box | None = None
+    ) -> Iterator[CellRow]:
+        """Cells changed after a log entry, in a box, of numbers above `after_key`, at most `limit`; no bodies."""
         found = (cell for key, cell in sorted(self._state.cells.items()) if key > after_key and cell.lm > after_seq)
-        for cell in islice(found, limit):
+        for cell in islice((cell for cell in found if _is_in(box, cell)), limit):
             yield replace(cell, body=b"", stamps=b"")
+
+    def cells_of(self, keys: Collection[CellKey]) -> list[CellRow]:
+        """Those of these cells that are stored, without their bodies, by rising number."""
+        found = (self._state.cells[key] for key in sorted(keys) if key in self._state.cells)
+        return [replace(cell, body=b"", stamps=b"") for cell in found]
+
+    def fingerprint_sum(self, box: Box | None = None) -> Fingerprint:
+        """Sum of the fingerprints of all cells, or of those in a box."""
+        return sum((cell.fingerprint for cell in self._state.cells.values() if _is_in(box, cell)), ZERO)
 
     def contributions(self, key: CellKey, *, after_seq: int, newest: int | None = None) -> list[Contribution]:
         """Entries after `after_seq` that touch a cell, oldest first, at most so many of the newest."""
         seqs = [seq for seq in self._state.touched.get(key, ()) if seq > after_seq]
         return [self._contribution(key, seq) for seq in seqs[-(newest or len(seqs)) :]]
-
-    def cell_states(self, keys: Collection[CellKey]) -> list[CellState]:
-        """Those of these cells that are stored, without their bodies, by rising number."""
-        found = (self._state.cells[key] for key in sorted(keys) if key in self._state.cells)
-        return [CellState(cell.key, cell.lm, cell.digest) for cell in found]
 
     def named(self, commits: Sequence[CommitId]) -> list[NamedCommit]:
         """State of each of these commits, folded or not, in the same order."""
@@ -104,15 +110,21 @@ class MemorySnapshot:
         """Commits that are kept but not folded, without those that are set aside as damaged."""
         return EMPTY.with_commits(kept.new.id for kept in self._state.waiting())
 
-    def folded_before(self, age_s: float) -> VersionVector:
-        """Commits folded before an age of the store."""
-        return EMPTY.with_commits(kept.new.id for kept in self._folded() if kept.folded_age_s < age_s)
+    def vector_at(self, seq: int) -> VersionVector:
+        """Ids of the commits folded at or before a log entry."""
+        return EMPTY.with_commits(
+            self._state.ids[entry.commit] for entry in self._state.entries[:seq] if entry.kind == ENTRY_FOLD
+        )
+
+    def seq_before(self, age_s: float) -> int:
+        """Newest log entry with a commit that was folded before an age of the store; 0: there is none."""
+        return max((kept.folded_seq or 0 for kept in self._folded() if kept.folded_age_s < age_s), default=0)
 
     def log(self, *, after_seq: int, limit: int, names_max: int | None = None) -> list[LogEntry]:
         """Log entries, oldest first: the first one, and as many more as name so many commits together at most."""
         found = self._state.entries[after_seq : after_seq + limit]
         entries = [self._log_entry(seq, entry) for seq, entry in enumerate(found, start=after_seq + 1)]
-        while names_max is not None and len(entries) > 1 and sum(len(e.retracts) for e in entries) > names_max:
+        while names_max is not None and len(entries) > 1 and sum(e.names for e in entries) > names_max:
             entries.pop()
         return entries
 
@@ -129,7 +141,7 @@ class MemorySnapshot:
         return Totals(
             cells=len(cells),
             size_bytes=sum(cell.size_bytes for cell in cells),
-            commits=len(self._state.commits),
+            commits=sum(not kept.is_damaged for kept in self._state.commits.values()),
             branches=len(self._state.branches),
             corner_cells=((min(axes[0]), min(axes[1]), min(axes[2])), (max(axes[0]), max(axes[1]), max(axes[2])))
             if cells
@@ -169,7 +181,12 @@ class MemorySnapshot:
             seen=meta.get("seen"),
             place_m=scans[-1]["t_map_rig"] if scans else None,
             via=kept.new.via,
+            note=meta.get("note", ""),
         )
+
+
+def _is_in(box: Box | None, cell: CellRow) -> bool:
+    return box is None or all(a <= n <= b for a, n, b in zip(box[0], cell_of_key(cell.key), box[1], strict=True))
 
 
 def _fits(kept: Kept, selection: Selection) -> bool:

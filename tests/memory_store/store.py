@@ -10,6 +10,7 @@ from dataclasses import replace
 
 from tests.memory_store.admission import admit_registration
 from tests.memory_store.figures import MemoryHealth, MemoryNotes, MemoryShares, MemoryUses
+from tests.memory_store.leases import MemoryLeases
 from tests.memory_store.map import new_memory_map
 from tests.memory_store.maps import MemoryMaps
 from tests.memory_store.robot_keys import MemoryAdmittedKeys
@@ -18,11 +19,12 @@ from tests.memory_store.tokens import MemoryAuditLog, MemoryTokens
 
 from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.ids import Author, CommitId, Incarnation, RobotName
-from cairn_map.errors import CairnError, ConflictError, NotFoundError, UnreachableError
+from cairn_map.errors import CairnError, NotFoundError, UnreachableError
 from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.store.admission import OWN_WORD, Grounds
-from cairn_server.store.store import Store
+from cairn_server.store.replica_notes import ReplicaNotes
+from cairn_server.store.store import Store, check_same_map
 from cairn_server.store.store_age import CLOCKS, AgeMark, Clocks, StoreAge
 from cairn_server.store.store_rows import Branch, Fold, MapRow, NewCommit, StoredCommit
 
@@ -32,8 +34,17 @@ log = logging.getLogger(__name__)
 class MemoryStore:
     """`store.Store` without a disk: what it acknowledges lasts as long as the process."""
 
-    def __init__(self, clocks: Clocks = CLOCKS) -> None:
+    def __init__(
+        self,
+        clocks: Clocks = CLOCKS,
+        *,
+        leases: MemoryLeases | None = None,
+        make_notes: Callable[[MemoryMaps], ReplicaNotes] | None = None,
+    ) -> None:
+        """Make an empty store; `make_notes` (`replicas.MemoryReplicaNotes`) where several servers work on it."""
         self._maps = MemoryMaps()
+        self.leases = leases
+        self.replicas = make_notes(self._maps) if make_notes else None
         self.age = StoreAge(AgeMark(), clocks)
         self.tokens = MemoryTokens(self._maps, self.age)
         self.keys = MemoryAdmittedKeys(self._maps)
@@ -49,8 +60,8 @@ class MemoryStore:
             known = maps.get(name)
             if known is None:
                 maps[name] = new_memory_map(len(maps) + 1, name, geometry, sensor_model)
-            elif (known.row.geometry, known.row.sensor_model) != (geometry, sensor_model):
-                raise ConflictError("map_exists", f"map {name} exists with another geometry or sensor model")
+            else:
+                check_same_map(name, (known.row.geometry, known.row.sensor_model), (geometry, sensor_model))
             return maps[name].row, known is None
 
     def map(self, name: str) -> MapRow:
@@ -61,6 +72,22 @@ class MemoryStore:
         """All maps, by name."""
         with self._maps.locked() as maps:
             return [maps[name].row for name in sorted(maps)]
+
+    def heads(self, maps: Collection[MapRow] | None = None) -> list[tuple[MapRow, Cursor]]:
+        """All maps, or those of these that there are, with their present states."""
+        with self._maps.locked() as kept:
+            asked = sorted(kept) if maps is None else sorted({row.name for row in maps} & kept.keys())
+            return [(kept[name].row, kept[name].head) for name in asked]
+
+    def waiting_maps(self) -> list[MapRow]:
+        """Maps with commits to be folded, or with a retract under way, by name."""
+        with self._maps.locked() as maps:
+            return [maps[name].row for name in sorted(maps) if any(kept.is_due for kept in maps[name].commits.values())]
+
+    def maps_with_evidence(self, *, before_s: float) -> list[MapRow]:
+        """Maps with evidence of commits folded before an age of the store, by name."""
+        with self._maps.locked() as maps:
+            return [maps[name].row for name in sorted(maps) if maps[name].has_evidence(before_s)]
 
     def append(self, row: MapRow, commit: NewCommit) -> bool:
         """Keep a commit; True if it is new, False if the same one is known already."""
@@ -159,13 +186,19 @@ class MemoryStore:
         with self._maps.changing(row) as changed:
             if changed.branches.pop(name, None) is None:
                 raise NotFoundError("no_branch", f"map {row.name} has no branch {name!r}")
-            changed.statuses.pop(name, None)
+            for notes in (changed.statuses, changed.heard_s, changed.views):
+                notes.pop(name, None)  # type: ignore[attr-defined]
             self.tokens.remove_of(row, name)
 
     def branches(self, row: MapRow) -> list[Branch]:
         """All branches, by name."""
         with self._maps.reading(row) as state:
             return [state.branches[name] for name in sorted(state.branches)]
+
+    def branch(self, row: MapRow, name: str) -> Branch | None:
+        """One branch as it is stored."""
+        with self._maps.reading(row) as state:
+            return state.branches.get(name)
 
     def keep_age(self) -> None:
         """Keep nothing: the store ends with the process."""

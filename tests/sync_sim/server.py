@@ -6,6 +6,7 @@ from typing import Any
 
 from tests.fixtures.client.made import GEOMETRY, MAP
 from tests.memory_store.map import MemoryMap
+from tests.memory_store.snapshot import MemorySnapshot
 from tests.memory_store.store import MemoryStore
 
 from cairn_client.sync.requests import Ask, GetCell, GetCommit, GetIndex, GetMissing, GetUpload, Push, PutCell, PutPart
@@ -25,10 +26,10 @@ from cairn_server.folding.cell_cache import CellCache
 from cairn_server.folding.folding import fold_pending
 from cairn_server.service import Service
 from cairn_server.settings import Settings
+from cairn_server.store.replica_notes import BodyPart
 from cairn_server.store.store_rows import MapRow
 from cairn_server.sync.asked_cells import asked_of
 from cairn_server.sync.handing_over import found_commit
-from cairn_server.sync.uploads import Part
 
 Fingerprints = dict[CellKey, str]
 
@@ -55,7 +56,7 @@ class StableBackup:
     def __init__(self, vector: VersionVector = EMPTY) -> None:
         self.vector = vector
 
-    def of(self, row: object, snapshot: object) -> VersionVector:
+    def of(self, snapshot: object) -> VersionVector:
         return self.vector
 
 
@@ -86,7 +87,7 @@ class SimServer:
     def back_up(self) -> None:
         """Make a backup, and throw older ones away: what it holds is stable."""
         state = self._store._maps.shared(self.row)
-        self._backup, self._stable.vector = state, state.head.vector
+        self._backup, self._stable.vector = state, MemorySnapshot(state).vector_at(state.head.seq)
 
     def restore(self) -> None:
         """Put the backup in the place of the store, and start on it."""
@@ -141,8 +142,10 @@ class SimServer:
             case GetUpload(commit_id, digest):
                 return service.sync.uploads.state(row, Caller(Role.ROBOT, robot), str(commit_id), digest)
             case PutPart(commit_id, digest, total, offset, data, signatures):
-                part = Part(digest, total, offset, data, signatures)
-                upload, _ = service.sync.uploads.add(row, Caller(Role.ROBOT, robot), str(commit_id), part)
+                part = BodyPart(digest, total, offset, data)
+                upload, _ = service.sync.uploads.add(
+                    row, Caller(Role.ROBOT, robot), str(commit_id), part, signatures=signatures
+                )
                 kept = service.store.commit(row, commit_id)
                 if kept is not None and not kept.gone:  # perhaps under an id that was another server's
                     meta, cells = split_commit(found_commit(service.store, row, str(commit_id)).data)
@@ -154,8 +157,11 @@ class SimServer:
             case GetMissing(request):
                 sent = MissingRequest.model_validate_json(request.model_dump_json())
                 return service.sync.replies.missing(row, robot, asked_of(sent))
-            case GetIndex(author):
-                return CellIndex.model_validate_json(service.sync.replies.cell_index(row, author).model_dump_json())
+            case GetIndex(author, held=held):
+                since = held.to if held else None
+                index = service.sync.replies.cell_index(row, author, since=since)
+                found = CellIndex.model_validate_json(index.model_dump_json())
+                return found.model_copy(update={"header": found.header.whole(held, since=since)})
             case GetCell(cell, etag):
                 stored, head = service.cells.sound(row, cell_key(cell))
                 if stored is None:
@@ -239,7 +245,7 @@ class SimServer:
     def cursor(self) -> Cursor:
         """Where its log ends."""
         with self._store.snapshot(self.row) as snapshot:
-            return snapshot.head.cursor
+            return snapshot.head
 
     @property
     def row(self) -> MapRow:
@@ -254,7 +260,7 @@ class SimServer:
 
     def _note_state(self) -> None:
         with self._store.snapshot(self.row) as snapshot:
-            self.states[snapshot.head.cursor] = {row.key: row.fingerprint.hex() for row in snapshot.cells()}
+            self.states[snapshot.head] = {row.key: row.fingerprint.hex() for row in snapshot.cells()}
 
 
 def with_more(first: str, others: Iterable[str], chance: Random) -> tuple[str, ...]:

@@ -1,5 +1,6 @@
 """Calibrate cameras and rigs, and exchange them with other programs.
 
+    $ cairn calib check rig.json
     $ cairn calib convert rig.json camchain.yaml --format kalibr
 
 `cairn calib COMMAND --help` for each. Frames, pixels and units: calib/CONVENTIONS.md.
@@ -10,6 +11,7 @@ from collections.abc import Callable
 from importlib import import_module
 from importlib.metadata import entry_points
 
+from cairn_calib.cli import check as check_command
 from cairn_calib.cli import convert as convert_command
 from cairn_calib.cli import corners as corners_command
 from cairn_calib.cli import report as report_command
@@ -18,7 +20,7 @@ from cairn_calib.cli import thermal as thermal_command
 
 # A subcommand is a module with `add_parser(commands)`, which sets `run`, a function of the parsed arguments; or, where
 # it needs recordings or the simulator, one with `main(argv)` behind an entry point of GROUP.
-SUBCOMMANDS = (convert_command, corners_command, solve_command, report_command, thermal_command)
+SUBCOMMANDS = (check_command, convert_command, corners_command, solve_command, report_command, thermal_command)
 GROUP = "cairn.calib"
 ELSEWHERE = {
     "verify": "how well a rig carries circle targets between its cameras",

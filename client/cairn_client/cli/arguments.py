@@ -19,8 +19,8 @@ from cairn_client.sync.responses import shown_text
 from cairn_map.errors import EXIT_CODES
 
 TOKEN_VARIABLE = "CAIRN_TOKEN"  # noqa: S105 - the variable's name
-NEGATIVE_LIST = re.compile(r"-\d[-\d.]*[,:][-\d.,:]*")
-"""A list or span that begins with a negative number: `-1,0,0`, `-5:40`."""
+NEGATIVE = re.compile(r"-\d[-\d.]*[,:][-\d.,:]*|-[xyz]")
+"""A list or span that begins with a negative number, or an axis: `-1,0,0`, `-5:40`, `-y`."""
 
 Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 Run: TypeAlias = Callable[[argparse.Namespace], int]
@@ -30,7 +30,7 @@ AddParser: TypeAlias = Callable[[Subparsers], None]
 class CommandParser(argparse.ArgumentParser):
     """A parser whose help, and that of its subcommands, is printed as written, and ends with the exit codes.
 
-    It takes `-1,0,0` and `-5:40` for values, where argparse by itself does so with `-1` alone.
+    It takes `-1,0,0`, `-5:40` and `-y` for values, where argparse by itself does so with `-1` alone.
     """
 
     def __init__(self, *args: Any, **options: Any) -> None:
@@ -41,11 +41,9 @@ class CommandParser(argparse.ArgumentParser):
     def parse_known_args(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, args: Any = None, namespace: Any = None
     ) -> Any:
-        """As argparse, which takes no word for an option that begins with a space; numbers may begin with one."""
+        """As argparse, which takes no word for an option that begins with a space; values may begin with one."""
         words = sys.argv[1:] if args is None else args
-        return super().parse_known_args(
-            [f" {word}" if NEGATIVE_LIST.fullmatch(word) else word for word in words], namespace
-        )
+        return super().parse_known_args([f" {word}" if NEGATIVE.fullmatch(word) else word for word in words], namespace)
 
 
 def parser(program: str, text: str | None) -> argparse.ArgumentParser:

@@ -9,7 +9,7 @@
     ok    disk          212.40 GB free at /data
     ok    server        answers in 1.2 ms (median of 5; 1.9 ms at worst)
     ok    protocol      version 1, here and there
-    ok    clock         the server's is +0.1 s from ours, to within 0.5 s
+    ok    clock         the server's agrees with ours, to within 1.0 s
     ok    ready         takes pushes and folds them
     ok    token         no token: map lab may be read; 34 cells, 15 commits
     ok    speed         48.1 MB/s down: a cell of 212.0 kB in 4 ms
@@ -21,6 +21,7 @@ state folder (of a robot, or of `cairn clone`), its content, and of a copy the w
 
 import json
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 from cairn_client.cli.arguments import add_token, parser, say
@@ -29,14 +30,17 @@ from cairn_client.cli.doctor_checks import (
     CheckResult,
     disk_check,
     folder_checks,
+    grid_check,
     installation_checks,
     server_checks,
 )
 from cairn_client.folders.state_folder import opened_replica
+from cairn_client.http.api import MapApi
 from cairn_client.http.map_url import split_map_url
 from cairn_client.http.origin_tokens import OriginTokens
 from cairn_client.robot.membership import own_token
 from cairn_map.errors import CairnError
+from cairn_map.evidence.grid import Geometry
 
 SOUND, ILL = 0, 1
 
@@ -66,9 +70,13 @@ def _checks(target: str | None, tokens: OriginTokens) -> Iterator[Check]:
         yield from _of_url(target, tokens.of(target))
     elif target is not None:
         yield from folder_checks(Path(target))
-        url, kept_token = _link_of(Path(target))
-        if url is not None:
-            yield from _of_url(url, kept_token or tokens.of(url))
+        link = _link_of(Path(target))
+        if link is not None:
+            token = link.token or tokens.of(link.url)
+            yield from _of_url(link.url, token)
+            server, name = split_map_url(link.url)
+            with MapApi(server, token=token) as api:
+                yield grid_check(api, name, link.geometry)
 
 
 def _of_url(url: str, token: str | None) -> Iterator[Check]:
@@ -76,14 +84,21 @@ def _of_url(url: str, token: str | None) -> Iterator[Check]:
     yield from server_checks(server, name, token=token)
 
 
-def _link_of(folder: Path) -> tuple[str | None, str | None]:
-    """The URL that a copy is from, and the token that it has; Nones where the folder cannot be opened."""
+@dataclass(frozen=True, slots=True)
+class _Link:
+    url: str
+    token: str | None
+    geometry: Geometry
+
+
+def _link_of(folder: Path) -> _Link | None:
+    """The map that a folder is of; None where it cannot be opened, or knows none."""
     try:
         with opened_replica(folder) as replica:
             url = replica.state.url
-            return url, own_token(replica.state, url) if url else None
+            return _Link(url, own_token(replica.state, url), replica.geometry) if url else None
     except CairnError:  # said already
-        return None, None
+        return None
 
 
 def _show(check: Check) -> None:

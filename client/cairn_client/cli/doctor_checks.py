@@ -22,13 +22,14 @@ from cairn_client.folders.state_folder import is_copy, opened_replica
 from cairn_client.http.api import PROTOCOL_VERSION, MapApi
 from cairn_client.http.http_link import index_of
 from cairn_map.errors import CairnError, ConflictError, DeniedError, NotFoundError, UnreachableError
-from cairn_map.evidence.grid import Cell
+from cairn_map.evidence.grid import Cell, Geometry
 from cairn_map.kernels.numba_runtime import is_compiled, known_kernels
 
 PINGS = 5
 LATENCY_WARN_S = 1.0
 CLOCK_WARN_S, CLOCK_FAIL_S = 5.0, 3600.0
 """Seconds between the clocks. A robot's clock dates its scans; an hour off is another time zone, or no clock at all."""
+DATE_ERROR_S = 1.0
 SPEED_WARN_BYTES = 8_000
 """Bytes a second: 64 kbit/s."""
 MEASURED_BYTES_MIN = 20_000
@@ -99,6 +100,22 @@ def _python() -> Check:
     if sys.version_info < PYTHON_MIN:
         return Check("python", CheckResult.FAIL, found, f"cairn needs Python {'.'.join(map(str, PYTHON_MIN))} or later")
     return Check("python", CheckResult.OK, found)
+
+
+def grid_check(api: MapApi, map_name: str, own: Geometry) -> Check:
+    """Check of a folder's grid against that of its map."""
+    try:
+        there = api.map_info(map_name).geometry
+    except CairnError as exc:
+        return Check("grid", CheckResult.WARN, f"not compared: {exc.message} [{exc.kind}]", "mend the link first")
+    if there != own:
+        return Check(
+            "grid",
+            CheckResult.FAIL,
+            f"the folder has {own}, map {map_name} has {there}",
+            "its waiting commits stay in it, and fit no other grid: keep the folder, and start with a new one",
+        )
+    return Check("grid", CheckResult.OK, f"{own}, here and there")
 
 
 def _cairn() -> Check:
@@ -191,8 +208,8 @@ def _pings(api: MapApi) -> tuple[list[float], float | None]:
         waits_s.append(time.monotonic() - start_s)
         date = answer.headers.get("date")
         if date:
-            # HTTP's time is cut to whole seconds: it is half a second old on average.
-            offset_s = parsedate_to_datetime(date).timestamp() + 0.5 - (sent_s + waits_s[-1] / 2)
+            # HTTP's time is cut to whole seconds, and made once a second: it is up to two seconds old.
+            offset_s = parsedate_to_datetime(date).timestamp() + DATE_ERROR_S - (sent_s + waits_s[-1] / 2)
     return waits_s[1:], offset_s
 
 
@@ -207,10 +224,13 @@ def _latency(waits_s: list[float]) -> Check:
 
 
 def clock_check(offset_s: float | None, wait_s: float) -> Check:
-    """Check of the lead of the server's clock, seconds, measured to within half a second and half of `wait_s`."""
+    """Check of the lead of the server's clock, seconds, measured to within `DATE_ERROR_S` and half of `wait_s`."""
     if offset_s is None:
         return Check("clock", CheckResult.WARN, "the server does not state its time", "compare the clocks by hand")
-    found = f"the server's is {offset_s:+.1f} s from ours, to within {0.5 + wait_s / 2:.1f} s"
+    error_s = DATE_ERROR_S + wait_s / 2
+    if abs(offset_s) <= error_s:
+        return Check("clock", CheckResult.OK, f"the server's agrees with ours, to within {error_s:.1f} s")
+    found = f"the server's is {offset_s:+.1f} s from ours, to within {error_s:.1f} s"
     advice = "set this machine's clock (NTP, chrony): commits state when their scans were taken"
     if abs(offset_s) > CLOCK_FAIL_S:
         return Check("clock", CheckResult.FAIL, found, advice)

@@ -1,11 +1,12 @@
 """A robot's events as lines for people, and signals that ask a command to come to its end."""
 
+import select
 import signal
+import socket
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from queue import Empty, SimpleQueue
+from contextlib import contextmanager
 from types import FrameType
 
 from cairn_client.cli.arguments import shown_bytes
@@ -70,35 +71,34 @@ def lines_on_stderr(stream: EventStream) -> Iterator[None]:
 class Stopping:
     """Flag that a signal's handler sets, and that the main thread waits for.
 
-    A `threading.Event` must not be set by a handler: that runs in the main thread, which may hold the event's own lock
-    at this moment, on its way into `wait`. What is put into a `SimpleQueue` needs no lock that it could hold.
+    A handler runs between two instructions of the main thread. A signal that comes when the last one before a wait is
+    done, or that the system gives to another thread, does not end a wait for a lock. The interpreter itself writes to
+    the socket as soon as a signal comes, in whatever thread; the wait is for that.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, woken: socket.socket) -> None:
+        """With the socket that has bytes to read once a signal came."""
         self._is_set = False
-        self._said = SimpleQueue[None]()
+        self._woken = woken
 
     def set(self) -> None:
-        """Set the flag; may be called from a handler of signals."""
+        """Set the flag; for the handler."""
         self._is_set = True
-        self._said.put(None)
 
     def is_set(self) -> bool:
         """True if a signal came."""
         return self._is_set
 
     def wait(self, timeout_s: float | None = None) -> bool:
-        """Wait for a signal, at most so many seconds (None: without end); True if one came. For one thread."""
+        """Wait for a signal, at most so many seconds (None: without end); True if one came."""
         if not self._is_set:
-            with suppress(Empty):
-                self._said.get(timeout=timeout_s)
+            select.select([self._woken], [], [], timeout_s)
         return self._is_set
 
 
 @contextmanager
 def until_signal() -> Iterator[Stopping]:
     """A flag that ^C or SIGTERM sets; the second one interrupts whatever goes on, as usual."""
-    stopping = Stopping()
 
     def stop(number: int, frame: FrameType | None) -> None:
         stopping.set()
@@ -108,8 +108,14 @@ def until_signal() -> Iterator[Stopping]:
         for number, handler in before.items():
             signal.signal(number, handler)
 
-    before = {number: signal.signal(number, stop) for number in SIGNALS}
-    try:
-        yield stopping
-    finally:
-        restore()
+    woken, waking = socket.socketpair()
+    with woken, waking:
+        waking.setblocking(False)
+        stopping = Stopping(woken)
+        woken_before = signal.set_wakeup_fd(waking.fileno())
+        before = {number: signal.signal(number, stop) for number in SIGNALS}
+        try:
+            yield stopping
+        finally:
+            restore()
+            signal.set_wakeup_fd(woken_before)

@@ -1,16 +1,19 @@
 """Command-line options for a folder of frames that is no recording: patterns, intrinsics, conventions."""
 
 import argparse
+from pathlib import Path
 
 from pydantic import ValidationError
 
+from cairn_client.cli.arguments import say
 from cairn_client.cli.pose_arguments import add_convention_arguments
-from cairn_fusion.recording.frame_folder import FrameFolderOptions
+from cairn_fusion.recording.frame_folder import FrameFolderOptions, image_patterns
 from cairn_fusion.recording.recording_format import Convention
 from cairn_map.errors import BadInputError
 
 TEXT = """Any folder with one file per frame and image: give --depth, --pose, --intrinsics, and options of other images.
 Patterns are relative to the folder and hold {id}, e.g. --depth 'frames/{id}.depth.png' --pose 'frames/{id}.pose.txt'.
+Without --depth, folders named depth, rgb (color, image) and thermal (lwir) in any letters are taken as they are.
 All images must be one raster (registered); a pose is a 4x4 matrix in text, without {id} one file for all frames.
 An {id} such as 1305031102.160407 (seconds) or 1403636579763555584 (nanoseconds) is the frame's time."""
 OPTIONS = (
@@ -45,14 +48,15 @@ def add_frame_arguments(command: argparse.ArgumentParser) -> None:
     add_convention_arguments(command)
 
 
-def frame_options(args: argparse.Namespace) -> FrameFolderOptions | None:
+def frame_options(args: argparse.Namespace, folder: Path) -> FrameFolderOptions | None:
     """The options given, or None if there are none: then the folder's own layout counts.
+
+    With intrinsics alone the patterns are found by the names of the folder's own folders.
 
     Raises:
         BadInputError: options that do not make a whole.
     """
-    # Commands without `add_pose_arguments` have no pose files.
-    has_file = getattr(args, "poses", None) is not None
+    has_file = args.poses is not None
     if has_file and args.pose is not None:
         raise BadInputError("bad_option", "--pose and --poses are two sources of the same poses; give one of them")
     names = OPTIONS if has_file else (*OPTIONS, *OPTIONS_OF_PATTERN)
@@ -61,6 +65,11 @@ def frame_options(args: argparse.Namespace) -> FrameFolderOptions | None:
         given |= _intrinsics(args.intrinsics)
     if not given:
         return None
+    if args.depth is None and args.intrinsics is not None and folder.is_dir():
+        found = image_patterns(folder)
+        given = found | given
+        if found:
+            say("images: " + ", ".join(f"{kind} {pattern}" for kind, pattern in sorted(found.items())))
     try:
         return FrameFolderOptions.model_validate(given)
     except ValidationError as exc:

@@ -18,7 +18,7 @@ FIELD_OF_OPTION = {
     "poses": "path",
     "pose_convention": "convention",
     "axes": "axes",
-    "scale": "scale",
+    "pose_scale": "scale",
     "T_body_sensor": "T_body_sensor",
     "poses_of": "of",
     "pose_time_unit": "time_unit",
@@ -30,11 +30,13 @@ OF_PATTERNS = ("pose_convention", "axes")
 """Options that count for `--pose PATTERN` as well."""
 
 
-def add_pose_arguments(command: argparse.ArgumentParser) -> None:
-    """Add the options, but for those that `add_convention_arguments` adds."""
+def add_pose_arguments(command: argparse.ArgumentParser, *, scale: tuple[str, ...]) -> None:
+    """Add the options, but for those that `add_convention_arguments` adds; `scale` are the names of one of them."""
     group = command.add_argument_group("poses of a published form", TEXT)
     group.add_argument("--poses", type=Path, metavar="FILE", help="pose file, or folder of matrices")
-    group.add_argument("--scale", type=float, metavar="METRES_PER_UNIT", help="length of one unit of the positions")
+    group.add_argument(
+        *scale, dest="pose_scale", type=float, metavar="METRES_PER_UNIT", help="length of one unit of the positions"
+    )
     group.add_argument("--T-body-sensor", type=Path, metavar="FILE", help="sensor.yaml with T_BS, or 4x4 in text")
     group.add_argument("--poses-of", metavar="CAMERA|rig", help="camera of the rig that the poses are of")
     group.add_argument("--pose-time-unit", choices=list(UNITS_PER_S), help="unit of its times (s; EuRoC: ns)")
@@ -70,7 +72,8 @@ def pose_options(args: argparse.Namespace) -> PoseOptions | None:
     if args.poses is None:
         lone = [name for name in given if name not in OF_PATTERNS] + ["skip_bad"] * args.skip_bad
         if lone:
-            raise BadInputError("bad_option", f"--{lone[0].replace('_', '-')} is about a pose file: give --poses FILE")
+            name = "scale" if lone[0] == "pose_scale" else lone[0].replace("_", "-")
+            raise BadInputError("bad_option", f"--{name} is about a pose file: give --poses FILE")
         return None
     try:
         fields = {FIELD_OF_OPTION[name]: value for name, value in given.items()}

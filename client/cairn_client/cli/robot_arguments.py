@@ -73,6 +73,26 @@ def limits_of(args: argparse.Namespace) -> Limits:
     return Limits(disk_bytes_max=disk, memory_bytes_max=memory, outbox_bytes_max=outbox, keep_acked_s=args.keep_acked)
 
 
+def add_kept_scans(command: argparse.ArgumentParser) -> None:
+    """Add `--keep-scans`."""
+    command.add_argument(
+        "--keep-scans",
+        type=float,
+        default=0.0,
+        metavar="MB",
+        help="size of the newest scans kept in the robot's folder, so that their poses can be corrected by a program, "
+        "and their rig by `cairn reprocess` (0)",
+    )
+
+
+def kept_scans_bytes(args: argparse.Namespace) -> int:
+    """Bytes of scans to keep, as `--keep-scans` says."""
+    megabytes: float = args.keep_scans
+    if not 0 <= megabytes < float("inf"):
+        raise BadInputError("bad_option", f"--keep-scans takes megabytes of 0 or more, got {megabytes:g}")
+    return round(megabytes * 1e6)
+
+
 def place(text: str) -> tuple[float, float, float]:
     """X,Y,Z in metres."""
     try:

@@ -19,8 +19,9 @@ from pydantic import BaseModel, ConfigDict
 
 from cairn_client.replica.replica import Replica
 from cairn_client.replica.replica_schema import translate_damage
+from cairn_fusion.mapping.grouping import Grouping, measurements_by
 from cairn_fusion.recording.recording import Recording, open_recording
-from cairn_fusion.recording.recording_format import HEADER_FILE
+from cairn_fusion.recording.recording_format import HEADER_FILE, MEASUREMENTS_FILE
 from cairn_map.errors import BadInputError, DamagedDataError
 
 log = logging.getLogger(__name__)
@@ -39,7 +40,7 @@ class Mark(BaseModel):
     first_s: float
     """Time of its first scan, UTC: another recording may come under an old name."""
     stops: int
-    """Measurements that are commits, or gave no evidence."""
+    """Measurements that are commits, or gave no evidence; of a recording that groups nothing, their scans."""
     is_done: bool
     left_out: int = 0
     """Number of these measurements of which no commit can be made; a recording with one is not deleted."""
@@ -51,15 +52,17 @@ class Stop:
 
     folder: Path
     source: Recording
-    number: int
-    """Number of the measurement in its recording, from 0."""
+    scans: range
+    """Indices in the recording."""
+    done: int
+    """Measurements, or scans, of the recording that are done with this one; see `Mark.stops`."""
     left_out: int
     """Measurements before it that were left out."""
 
     @property
-    def scans(self) -> range:
-        """Indices in the recording."""
-        return self.source.measurements()[self.number]
+    def name(self) -> str:
+        """The measurement, for messages."""
+        return f"scans {self.scans.start} to {self.scans.stop - 1} of {self.folder}"
 
     def mark(self) -> Mapping[str, str]:
         """Texts to remember when the measurement is done."""
@@ -70,9 +73,8 @@ class Stop:
         return self._mark(left_out=self.left_out + 1)
 
     def _mark(self, *, left_out: int) -> Mapping[str, str]:
-        done = self.number + 1
-        is_done = done == len(self.source.measurements())
-        mark = Mark(first_s=self.source.files[0].time_s, stops=done, is_done=is_done, left_out=left_out)
+        is_done = self.scans.stop == len(self.source)
+        mark = Mark(first_s=self.source.files[0].time_s, stops=self.done, is_done=is_done, left_out=left_out)
         return {_key(self.folder): mark.model_dump_json()}
 
 
@@ -110,8 +112,8 @@ class Spool:
             first_s = source.files[0].time_s
             mark = _mark(replica, path, first_s)
             if not mark.is_done:
-                for number in range(mark.stops, len(source.measurements())):
-                    yield Stop(path, source, number, _mark(replica, path, first_s).left_out)
+                for scans, done in _left(path, source, mark.stops):
+                    yield Stop(path, source, scans, done, _mark(replica, path, first_s).left_out)
             self._settled[path] = stamp, first_s
 
     def delete_done(self, replica: Replica) -> None:
@@ -157,6 +159,20 @@ class Spool:
             self._settled[path] = stamp, None
             return None
         return source
+
+
+def _left(folder: Path, source: Recording, done: int) -> Iterator[tuple[range, int]]:
+    """Scans of each measurement that is not done, with the count that is done after it.
+
+    Where the recording groups nothing, scans are grouped by `Grouping`, from the first that is not done; so the count
+    is of scans, as it was when each scan was a measurement.
+    """
+    if (folder / MEASUREMENTS_FILE).exists():
+        yield from ((stop, number) for number, stop in enumerate(source.measurements()[done:], done + 1))
+        return
+    left = [(entry.time_s, entry.T_map_rig) for entry in source.files[done:]]
+    for group in measurements_by(Grouping(), left):
+        yield range(done + group.start, done + group.stop), done + group.stop
 
 
 def remember(replica: Replica, texts: Mapping[str, str | None]) -> None:

@@ -16,6 +16,16 @@ def is_state_folder(folder: Path) -> bool:
     return (folder / FILE_NAME).is_file()
 
 
+def check_state_folder(folder: Path) -> None:
+    """Check that a robot or a copy keeps its map in a folder.
+
+    Raises:
+        BadInputError: kind `no_state_folder`: neither does.
+    """
+    if not is_state_folder(folder):
+        raise BadInputError("no_state_folder", f"{folder} is no robot's folder and no copy: there is no {FILE_NAME}")
+
+
 def robot_of(folder: Path) -> str | None:
     """Name of the robot whose folder it is; None: no robot's yet. Raises: ConflictError: a robot has it open."""
     if not is_state_folder(folder):
@@ -33,8 +43,7 @@ def opened_replica(folder: Path) -> Iterator[Replica]:
         ConflictError: a robot has it open.
         DamagedDataError: it is broken.
     """
-    if not is_state_folder(folder):
-        raise BadInputError("no_state_folder", f"{folder} is no robot's folder and no copy: there is no {FILE_NAME}")
+    check_state_folder(folder)
     with closing(ReplicaStore(folder)) as store:
         state = ReplicaState(store)
         robot, map_name, geometry = state.robot, state.map_name, state.geometry

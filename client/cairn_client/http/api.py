@@ -50,6 +50,7 @@ from cairn_map.wire.messages import (
     PushReceipt,
     Register,
     Registered,
+    ReplyHeader,
     Retract,
     Retracted,
     RobotStatus,
@@ -308,14 +309,25 @@ class MapApi:
         return list_of(LogEntry, self._ask("GET", f"/maps/{name}/log", params={"after": after, "limit": limit}))
 
     def cell_index(
-        self, name: str, author: Author | None = None, *, box: Box | None = None, after: Cell | None = None
+        self,
+        name: str,
+        author: Author | None = None,
+        *,
+        box: Box | None = None,
+        after: Cell | None = None,
+        held: ReplyHeader | None = None,
     ) -> CellIndex:
-        """A page of the cells of a map, or of a box (lowest and highest cell); all: `cell_index.whole_index`."""
-        asked = {"author": author, "box": f"{box[0]},{box[1]}" if box else None, "after": after}
+        """A page of the cells of a map, or of a box (lowest and highest cell); all: `cell_index.whole_index`.
+
+        What the header held says of the commits in the map does not come again.
+        """
+        since = held.to if held else None
+        asked = {"author": author, "box": f"{box[0]},{box[1]}" if box else None, "after": after, "since": since}
         params = {"limit": str(INDEX_PAGE), "hottest": "true"} | {
             key: str(value) for key, value in asked.items() if value is not None
         }
-        index = message_from_json(CellIndex, self._ask("GET", f"/maps/{name}/main/cells", params=params))
+        found = message_from_json(CellIndex, self._ask("GET", f"/maps/{name}/main/cells", params=params))
+        index = found.model_copy(update={"header": found.header.whole(held, since=since)})
         self._vector = index.header.coverage
         return index
 

@@ -68,8 +68,8 @@ class Link:
                 return next(self._frames, None)
             case NextFrame():
                 return next(self._frames, None) if self._frames else None
-            case GetIndex(author, box, after):
-                return api.cell_index(name, author, box=box, after=after)
+            case GetIndex(author, box, after, held):
+                return api.cell_index(name, author, box=box, after=after, held=held)
             case GetCell(cell, etag):
                 return api.cell(name, cell, etag=etag)
             case PutCell(cell, body):

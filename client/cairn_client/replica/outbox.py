@@ -13,9 +13,18 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
+import numpy as np
+import numpy.typing as npt
 from pydantic import ValidationError
 
-from cairn_client.replica.replica_state import ReplicaState, RobotKeys, Successors
+from cairn_client.replica.replica_state import (
+    AmendRecord,
+    AmendRecords,
+    ReplicaState,
+    RobotKeys,
+    Successors,
+    poses_to_text,
+)
 from cairn_client.replica.replica_store import KeptCommit
 from cairn_map.codec.cell_code import Profile, decode_cell
 from cairn_map.commits.commit import Commit, CommitMeta, ScanPose, make_commit, renamed_commit, split_commit
@@ -30,6 +39,8 @@ from cairn_map.wire.messages import ReplyHeader
 
 log = logging.getLogger(__name__)
 
+READ_LAST_BYTES_MAX = 8 << 20
+"""Bytes of commits that stay in memory after they were read."""
 NO_NOTES: Mapping[str, str] = MappingProxyType({})
 
 
@@ -122,7 +133,10 @@ class Outbox:
         self._acked_since_header: set[CommitId] = set()
         self._retracts: dict[CommitId, tuple[CommitId, ...]] = {}
         """Commits that each kept commit takes out, as far as they were read."""
+        self._read_last: dict[CommitId, tuple[int, dict[CellKey, bytes]]] = {}
+        """Size, and bytes of the cells, of the commits read last, oldest first."""
         self.successors = Successors(self._store)
+        self.amends = AmendRecords(self._store)
         for kept in self._store.commits():
             self._note(kept)
 
@@ -148,6 +162,7 @@ class Outbox:
         seen: Cursor | None,
         profile: Profile = Profile.FAST,
         notes: Mapping[str, str] = NO_NOTES,
+        record: AmendRecord | None = None,
     ) -> Commit:
         """Keep evidence as the next commit; durable on return.
 
@@ -157,6 +172,7 @@ class Outbox:
             seen: cursor of the server's state that is here.
             profile: effort spent on the size of its bytes.
             notes: texts by key to remember in the same transaction.
+            record: of an amend, whose place it takes.
 
         Raises:
             BadInputError: kind `not_own`: it retracts another robot's commit; only an operator may. Kind `bad_meta`:
@@ -178,12 +194,46 @@ class Outbox:
             self._set_next(n + 1, commit)
             for key, text in notes.items():
                 self._store.put(key, text)
+            if record is not None:
+                self.amends.put(commit.id, record)
             self._put_successor(commit)
         # Memory follows the disk, so that a transaction that failed leaves no trace.
         self._note(_kept(commit))
         self._read_successors(commit.meta.retracted_ids)
         self._retracts[commit.id] = commit.meta.retracted_ids
         return commit
+
+    def amend(
+        self,
+        target: CommitId,
+        diff: Mapping[CellKey, Evidence],
+        facts: CommitFacts,
+        *,
+        seen: Cursor | None,
+        profile: Profile,
+        T_map_rig: npt.NDArray[np.float64] | None = None,
+    ) -> Commit:
+        """Keep evidence as a commit that takes the place of what stands for another one, with a record of it; as `add`.
+
+        Args:
+            target: commit to replace, or any that it replaced.
+            diff: as for `add`.
+            facts: as for `add`, but for what it retracts.
+            seen: as for `add`.
+            profile: as for `add`.
+            T_map_rig: (N, 4, 4) poses of its scans; None: those that were observed.
+        """
+        # A retract takes effect once for each target (rule 11), so the newest form is named, not the first commit.
+        latest = self.successors.latest(target)
+        # The poses are kept as they are, because the commit states quaternions; after its bytes only this remains.
+        record = AmendRecord(
+            of=str(latest),
+            rig=facts.rig,
+            integrator=facts.integrator,
+            scans=len(facts.scans),
+            poses=None if T_map_rig is None else poses_to_text(T_map_rig),
+        )
+        return self.add(diff, replace(facts, retracts=(latest,)), seen=seen, profile=profile, record=record)
 
     def keep_sealed(self, commit: Commit, seal: str) -> None:
         """Keep a server's own retract, to push it back if the server is restored to a time before it (rule 11)."""
@@ -197,6 +247,11 @@ class Outbox:
     def knows(self, commit: CommitId) -> bool:
         """True if a commit is here, or was."""
         return commit in self._commits
+
+    def has_evidence(self, commit: CommitId) -> bool:
+        """False if a commit is known to hold none."""
+        kept = self._commits.get(commit)
+        return kept is None or bool(kept.cells)
 
     def seal(self, commit: CommitId) -> str | None:
         """The seal that a kept commit bears."""
@@ -266,6 +321,7 @@ class Outbox:
             for amend in amends:
                 self._store.replace_commit(amend)
             self.successors.rename(commit, renamed.id, takes_out=renamed.meta.retracted_ids)
+            self.amends.rename(commit, renamed.id)
         for key in self._commits.pop(commit).cells:
             del self._touching[key][commit]
         for changed in (renamed, *amends):
@@ -318,7 +374,8 @@ class Outbox:
         latest = self.successors.latest(commit)
         found = next((original for original in originals if self.successors.latest(original) == latest), None)
         found = commit if commit in originals else found
-        if found not in (None, latest) and self.knows(found):  # unknown: it got a new id (SYNC.md rule 13)
+        # Unknown: it got a new id (SYNC.md rule 13). A kill right after an amend leaves its scans under the older id.
+        if found not in (None, latest) and self.knows(found) and not self.amends.leads(latest, found):
             raise ConflictError("taken_back", f"{found} was taken back by {latest}: there is nothing to amend")
         return found
 
@@ -337,6 +394,7 @@ class Outbox:
         for commit in commits:
             self._commits[commit] = replace(self._commits[commit], has_data=False)
             self._retracts.pop(commit, None)
+            self._read_last.pop(commit, None)
 
     def reread(self) -> None:
         """Read again from the store which commits are acknowledged."""
@@ -354,6 +412,10 @@ class Outbox:
         kept = self._commits.get(commit)
         return kept if kept is not None and kept.has_data else None
 
+    def has_made(self, commit: CommitId) -> bool:
+        """True if a commit was ever kept here."""
+        return commit in self._commits
+
     def own_evidence(self, key: CellKey, news: VersionVector, author: Author) -> list[Evidence] | None:
         """Evidence of a cell from an author's commits among `news`; None if the bytes of one are not kept any more."""
         mine = [commit for commit in self._touching.get(key, ()) if commit.author == author and commit in news]
@@ -367,11 +429,24 @@ class Outbox:
         Raises:
             DamagedDataError: its bytes at rest are not sound any more.
         """
-        return decode_cell(split_commit(self._store.commit_data(commit) or b"")[1][key]).evidence
+        return decode_cell(self._bodies(commit)[key]).evidence
+
+    def _bodies(self, commit: CommitId) -> dict[CellKey, bytes]:
+        """Bytes of the cells of a commit; those of the commits read last stay, for a folder is read cell by cell."""
+        if commit not in self._read_last:
+            data = self._store.commit_data(commit) or b""
+            self._read_last[commit] = len(data), split_commit(data)[1]
+            # Those read longest ago go first, and the newest one too if it alone is too large.
+            found = self._read_last[commit][1]
+            while sum(size for size, _ in self._read_last.values()) > READ_LAST_BYTES_MAX:
+                del self._read_last[next(iter(self._read_last))]
+            return found
+        return self._read_last[commit][1]
 
     def _note(self, kept: KeptCommit) -> None:
         # Its bytes may be new ones: a rename changes what an amend names.
         self._retracts.pop(kept.id, None)
+        self._read_last.pop(kept.id, None)
         self._commits[kept.id] = kept
         for key in kept.cells:
             self._touching.setdefault(key, {})[kept.id] = None

@@ -17,6 +17,9 @@ from dataclasses import replace
 from itertools import islice
 from typing import Protocol
 
+import numpy as np
+import numpy.typing as npt
+
 from cairn_client.replica.limits import KEEP_ACKED_S
 from cairn_client.replica.outbox import NO_FACTS, NO_NOTES, CommitFacts, Outbox
 from cairn_client.replica.replica_state import ReplicaState
@@ -28,7 +31,7 @@ from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.ids import OPERATOR, Author, CommitId, RobotName
 from cairn_map.commits.signature import Signature
 from cairn_map.commits.version_vector import EMPTY
-from cairn_map.errors import BadInputError, CairnError
+from cairn_map.errors import BadInputError, CairnError, ConflictError
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.fingerprint import Fingerprint
@@ -216,12 +219,38 @@ class Replica:
             return commit
 
     def amend(
-        self, target: CommitId, diff: Mapping[CellKey, Evidence], facts: CommitFacts, *, profile: Profile
+        self,
+        target: CommitId,
+        diff: Mapping[CellKey, Evidence],
+        facts: CommitFacts,
+        *,
+        profile: Profile,
+        T_map_rig: npt.NDArray[np.float64] | None = None,
     ) -> Commit:
-        """Keep evidence as a commit that takes the place of another one, or of what stands for that; as `commit`."""
+        """Keep evidence as a commit that takes the place of what stands for another one; as `Outbox.amend`."""
         with self._lock:  # the sync may give the target another id, but not meanwhile
+            commit = self.outbox.amend(
+                target, diff, facts, seen=self.default_cursor, profile=profile, T_map_rig=T_map_rig
+            )
+            self._base.show_commit(commit, {key: diff[key] for key in commit.cells})
+            return commit
+
+    def retract(self, target: CommitId, facts: CommitFacts) -> Commit:
+        """Keep a commit without evidence that takes out another one, or what stands for that; as `commit`.
+
+        Raises:
+            ConflictError: kind `taken_back`: it was taken out, and nothing stands for it.
+        """
+        with self._lock:
             latest = self.outbox.successors.latest(target)
-            return self.commit(diff, replace(facts, retracts=(latest,)), profile=profile)
+            if latest != target and not self.outbox.has_evidence(latest):
+                raise ConflictError("taken_back", f"{target} was taken back before, by {latest}; there is nothing left")
+            return self.commit({}, replace(facts, retracts=(latest,)))
+
+    def has_made(self, commit: CommitId) -> bool:
+        """True if a commit was made in this folder, even if its bytes are gone."""
+        with self._lock:
+            return self.outbox.has_made(commit)
 
     def original_of(self, commit: CommitId, originals: Collection[CommitId]) -> CommitId | None:
         """Original of a commit: the one among `originals` that has the same successor; None if there is none.
@@ -247,6 +276,12 @@ class Replica:
         """Commits that the server may lack, oldest first."""
         with self._lock:
             return self.outbox.push_set(self.header)
+
+    def behind(self) -> tuple[int, int]:
+        """Number of own commits that the server may lack, and of those that it has, but not in its map yet."""
+        with self._lock:
+            pending = self.header.pending_vector.of_robots((self.author.robot,)) if self.header else EMPTY
+            return len(self.outbox.push_set(self.header)), len(pending)
 
     def backlog(self) -> tuple[int, int]:
         """Number of the commits that the server may lack, and the size of their bytes."""

@@ -3,17 +3,21 @@
     ReplicaState    whose folder it is, its place on the server, its limits: one text for each field
     RobotKeys       keys that sign the robot's commits: one text for each incarnation
     Successors      commits that stand for others: one text for each commit that was taken out
+    AmendRecords    poses and rig of amends: one text for each amend
 
 A value that is set is durable on return, or with the transaction that this thread has open. The commits and cells have
 tables of their own in the store.
 """
 
+import base64
 import json
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Generic, Self, TypeVar, overload
 
+import numpy as np
+import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, TypeAdapter
 
 from cairn_client.replica.limits import Limits
@@ -305,3 +309,78 @@ class Successors:
 
 def _successor_key(commit: CommitId) -> str:
     return f"successor:{commit}"
+
+
+class AmendRecord(BaseModel):
+    """Facts of an amend that outlive its bytes: the commit whose place it took, and where its evidence comes from."""
+
+    model_config = ConfigDict(frozen=True)
+
+    of: str
+    """Commit whose place it took: its scans are those of the amend."""
+    rig: str | None = None
+    """Digest of the rig, hex."""
+    integrator: str = ""
+    scans: int = 0
+    """Number of its scans."""
+    poses: str | None = None
+    """Poses of its scans, row by row in little-endian float64, base64; None: those that were observed."""
+
+    @property
+    def T_map_rig(self) -> npt.NDArray[np.float64] | None:
+        """(N, 4, 4) poses of its scans, bit for bit, where a commit states quaternions; None: those observed.
+
+        Raises:
+            DamagedDataError: kind `damaged_store`: they are no poses.
+        """
+        if self.poses is None:
+            return None
+        try:
+            return np.frombuffer(base64.b64decode(self.poses), "<f8").reshape(self.scans, 4, 4).astype(np.float64)
+        except ValueError as exc:
+            raise DamagedDataError("damaged_store", f"the poses of the amend of {self.of} are damaged: {exc}") from exc
+
+
+def poses_to_text(T_map_rig: npt.NDArray[np.float64]) -> str:
+    """Poses as an `AmendRecord` keeps them."""
+    return base64.b64encode(T_map_rig.astype("<f8").tobytes()).decode()
+
+
+class AmendRecords:
+    """Records of a robot's amends, in the transactions that keep the amends."""
+
+    def __init__(self, store: ReplicaStore) -> None:
+        self._store = store
+
+    def of(self, commit: CommitId) -> AmendRecord | None:
+        """The record of an amend; None of any other commit, and of one from before records were kept."""
+        text = self._store.get(_amend_key(commit))
+        with translate_damage(self._store.file):
+            return None if text is None else AmendRecord.model_validate_json(text)
+
+    def put(self, commit: CommitId, record: AmendRecord) -> None:
+        """Within a transaction, note what an amend is; the poses of the amend that it replaces go."""
+        self._store.put(_amend_key(commit), record.model_dump_json())
+        older = commit_id_from_text(record.of)
+        replaced = self.of(older)
+        if replaced is not None:
+            self._store.put(_amend_key(older), replaced.model_copy(update={"poses": None}).model_dump_json())
+
+    def rename(self, old: CommitId, new: CommitId) -> None:
+        """Within a transaction, note that an amend, if it is one, gets a new id."""
+        self._store.put(_amend_key(new), self._store.get(_amend_key(old)))
+
+    def leads(self, commit: CommitId, original: CommitId) -> bool:
+        """True if a commit came from an original by amends alone, so that the original's scans are its own."""
+        seen: set[CommitId] = set()
+        while commit != original:
+            record = self.of(commit)
+            if record is None or commit in seen:
+                return False
+            seen.add(commit)
+            commit = commit_id_from_text(record.of)
+        return True
+
+
+def _amend_key(commit: CommitId) -> str:
+    return f"amend:{commit}"

@@ -31,6 +31,22 @@ FactsOf = Callable[[Measurement, str], CommitFacts]
 """Facts of a measurement's commit, with its note."""
 
 
+def facts_of_measurement(
+    measurement: Measurement, *, note: str = "", retracts: tuple[CommitId, ...] = ()
+) -> CommitFacts:
+    """Statements of a measurement's commit about itself."""
+    # By its rig and its times an operator finds the commit again, to retract what a bad calibration made.
+    return CommitFacts(
+        captured_s=measurement.captured_s,
+        scans=tuple(measurement.poses),
+        sensors=tuple(measurement.rig.cameras),
+        rig=measurement.rig.digest(),
+        integrator=str(measurement.integrator),
+        retracts=retracts,
+        note=note,
+    )
+
+
 class Amending:
     """Amends of one robot's commits, by the thread that observes; documented at `Robot.amend`."""
 
@@ -70,15 +86,23 @@ class Amending:
         found = [(self._scans_of(measurement), _move(poses, None)) for measurement, poses in T_map_rig.items()]
         return [self._amend(commit, move, note=note, profile=profile) for commit, move in found]
 
+    def retract(self, measurement: AnyCommit, *, note: str) -> Commit:
+        """Take one measurement back; as `Robot.retract`."""
+        commit = self._replica.retract(_commit_id(measurement), CommitFacts(note=note))
+        self._on_commit(commit)
+        return commit
+
     def _amend(self, found: CommitId, move: Move, *, note: str, profile: Profile) -> Commit:
         measurement = self._new_measurement()
         if measurement is None:
             raise BadInputError("no_rig", "this robot was opened without a rig, so it cannot read scans")
         # The measurement again, from the same scans at their corrected poses.
+        poses = []
         for scan in move(self._kept.scans(found)):
             measurement.add(scan)
-        diff = measurement.diff()
-        commit = self._replica.amend(found, diff, self._facts_of(measurement, note), profile=profile)
+            poses.append(scan.T_map_rig)
+        diff, facts = measurement.diff(), self._facts_of(measurement, note)
+        commit = self._replica.amend(found, diff, facts, profile=profile, T_map_rig=np.array(poses))
         # The scans are kept under the amend from here on: the next amend names it.
         self._kept.rename(found, commit.id)
         self._on_commit(commit)
@@ -89,10 +113,17 @@ class Amending:
         commit = _commit_id(measurement)
         found = self._replica.original_of(commit, self._kept.commits)
         if found is None:
-            raise NotFoundError(
-                "no_scans", f"{commit} cannot be amended, its scans are not kept: {self._kept.why_gone()}"
-            )
+            raise NotFoundError("no_scans", f"{commit} cannot be amended: {self._why_not(commit)}")
         return found
+
+    def _why_not(self, commit: CommitId) -> str:
+        """Reason why a commit's scans are not here."""
+        own = self._replica.author.robot
+        if commit.author.robot != own:
+            return f"it is {commit.author.robot}'s, and this robot, {own}, amends its own alone"
+        if not self._replica.has_made(commit):
+            return "this folder knows no such commit; `cairn robot queue DIR` lists those it has"
+        return f"its scans are not kept: {self._kept.why_gone(commit)}"
 
 
 def _commit_id(commit: AnyCommit) -> CommitId:

@@ -22,13 +22,15 @@ from pathlib import Path
 from typing import BinaryIO
 
 from cairn_fusion.recording.scan import Scan
-from cairn_fusion.recording.scan_bytes import decode_scan, encode_scan
+from cairn_fusion.recording.scan_bytes import decode_scan, encode_scan, read_images
 from cairn_map.commits.ids import CommitId, commit_id_from_text
 from cairn_map.errors import BadInputError, DamagedDataError
 
 log = logging.getLogger(__name__)
 
 OPEN = "open.partial"
+LOST_MAX = 256
+"""Commits of which it is remembered why their scans are not kept."""
 FILE_NAME = re.compile(r"([0-9]{6,})\.(.+)\.scans")
 LENGTH = struct.Struct("<Q")
 
@@ -59,8 +61,10 @@ class KeptScans:
         self.bytes_max = bytes_max
         self._open: BinaryIO | None = None
         self._open_bytes = 0
-        self._is_given_up = False
-        """True if the scans of the open measurement are not kept."""
+        self._given_up = ""
+        """Reason why the scans of the open measurement are not kept; empty if they are."""
+        self._lost: dict[CommitId, str] = {}
+        """Reasons why scans of some commits were not kept, newest last."""
         # Replaced whole at each change, because the thread that syncs asks which commits are in it.
         self._files: dict[CommitId, ScanFile] = {}
         try:
@@ -80,13 +84,13 @@ class KeptScans:
 
     def add(self, scan: Scan) -> None:
         """Keep a scan of the open measurement; a scan that cannot be kept is logged, and is no failure."""
-        if not self.bytes_max or self._is_given_up:
+        if not self.bytes_max or self._given_up:
             return
         data = encode_scan(scan)
         record = LENGTH.pack(len(data)) + data
         if self._open_bytes + len(record) > self.bytes_max:
             log.warning("one measurement's scans need more than %d bytes; they are not kept", self.bytes_max)
-            self._forget_open(is_given_up=True)
+            self._forget_open("they alone are larger than keep_scans_bytes")
             return
         try:
             self._make_room(len(record))
@@ -97,7 +101,7 @@ class KeptScans:
             self._open_bytes += len(record)
         except OSError as exc:
             log.warning("the scans of this measurement are not kept: %s", exc.strerror)
-            self._forget_open(is_given_up=True)
+            self._forget_open(f"the disk did not take them ({exc.strerror})")
 
     def close_measurement(self, commit: CommitId) -> None:
         """Note that the open measurement became this commit."""
@@ -110,8 +114,11 @@ class KeptScans:
                 self._files = {**self._files, commit: ScanFile(number, commit, path, self._open_bytes)}
             except OSError as exc:
                 log.warning("the scans of commit %s are not kept: %s", commit, exc.strerror)
+                self._note_lost(commit, f"the disk did not take them ({exc.strerror})")
             self._open, self._open_bytes = None, 0
-        self._is_given_up = False
+        elif self._given_up:
+            self._note_lost(commit, self._given_up)
+        self._given_up = ""
 
     def rename(self, commit: CommitId, new: CommitId) -> None:
         """Note that the scans of a commit are those of its amend now."""
@@ -127,7 +134,7 @@ class KeptScans:
 
     def drop_measurement(self) -> None:
         """Forget the scans of the open measurement."""
-        self._forget_open(is_given_up=False)
+        self._forget_open()
 
     def scans(self, commit: CommitId) -> Iterator[Scan]:
         """The scans of a commit, in order, read one by one.
@@ -135,22 +142,43 @@ class KeptScans:
         Raises:
             DamagedDataError: a power cut or the disk damaged them.
         """
-        path = self._files[commit].path
-        with path.open("rb") as file:
-            while length := file.read(LENGTH.size):
-                if len(length) < LENGTH.size:
-                    raise DamagedDataError("damaged_scan", f"{path} ends early")
-                (size,) = LENGTH.unpack(length)
-                yield decode_scan(file.read(min(size, self._files[commit].size_bytes)))
+        kept = self._files[commit]
+        with kept.path.open("rb") as file:
+            while (size := _next_size(file, kept)) is not None:
+                yield decode_scan(file.read(size))
 
-    def why_gone(self) -> str:
-        """Reason why scans are not kept, with what to do about it."""
+    def sample_scans(self, commit: CommitId) -> Iterator[Scan]:
+        """One scan of a commit for each set of images that its scans have; of all others the images are not read.
+
+        Raises:
+            DamagedDataError: as `scans`.
+        """
+        kept, seen = self._files[commit], set()
+        with kept.path.open("rb") as file:
+            while (size := _next_size(file, kept)) is not None:
+                start = file.tell()
+                images = read_images(file)
+                if images not in seen:
+                    seen.add(images)
+                    file.seek(start)
+                    yield decode_scan(file.read(size))
+                file.seek(start + size)
+
+    def why_gone(self, commit: CommitId) -> str:
+        """Reason why the scans of a commit are not kept, with what to do about it."""
+        if commit in self._lost:
+            return self._lost[commit]
         if not self.bytes_max:
             return "this robot keeps none; open it with keep_scans_bytes=2_000_000_000, say, before it observes them"
         held = f"the newest {len(self._files)} measurements fill {self.size_bytes / 1e6:.1f} MB"
         return (
             f"{held} of {self.bytes_max / 1e6:.1f} MB, and older ones went; open the robot with larger keep_scans_bytes"
         )
+
+    def _note_lost(self, commit: CommitId, reason: str) -> None:
+        self._lost[commit] = reason
+        if len(self._lost) > LOST_MAX:
+            del self._lost[next(iter(self._lost))]
 
     def _make_room(self, size_bytes: int) -> None:
         """Remove the oldest files until so many more bytes fit, or none is left."""
@@ -159,14 +187,24 @@ class KeptScans:
             oldest.path.unlink(missing_ok=True)
             self._files = {commit: file for commit, file in self._files.items() if file is not oldest}
 
-    def _forget_open(self, *, is_given_up: bool) -> None:
+    def _forget_open(self, given_up: str = "") -> None:
         opened, self._open = self._open, None
-        self._open_bytes, self._is_given_up = 0, is_given_up
+        self._open_bytes, self._given_up = 0, given_up
         if opened is not None:
             with suppress(OSError):  # on a full disk closing fails, too: it writes what is buffered
                 opened.close()
             with suppress(OSError):
                 (self._folder / OPEN).unlink(missing_ok=True)
+
+
+def _next_size(file: BinaryIO, kept: ScanFile) -> int | None:
+    """Size of the scan that follows, at most that of the file; None at the end."""
+    length = file.read(LENGTH.size)
+    if not length:
+        return None
+    if len(length) < LENGTH.size:
+        raise DamagedDataError("damaged_scan", f"{kept.path} ends early")
+    return min(int(LENGTH.unpack(length)[0]), kept.size_bytes)
 
 
 def _files_in(folder: Path) -> dict[CommitId, ScanFile]:

@@ -155,7 +155,12 @@ class Membership:
 
     def _keep(self, registered: Registered) -> None:
         if registered.map.geometry != self._replica.geometry:
-            raise BadInputError("other_geometry", f"map {self._map_name} has another grid than this robot's directory")
+            raise BadInputError(
+                "other_geometry",
+                f"map {self._map_name} has {registered.map.geometry}; this robot's directory has "
+                f"{self._replica.geometry}. Its {len(self._replica.push_set())} waiting commits stay there: push them "
+                "to a map with their grid, and give the robot another directory for this map",
+            )
         state = self._replica.state
         state.note_model(registered.map.sensor_model)
         with state.store.transaction():

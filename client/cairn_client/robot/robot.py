@@ -6,10 +6,13 @@
         robot.commit()                 # one measurement, durable from here on
         robot.sync()                   # or let the background thread do it
 
-It maps on without a link: commits wait in the directory, and power may be cut at any instant.
+It maps on without a link: commits wait in the directory, and power may be cut at any instant. Any thread may call it;
+calls that add scans or make commits wait for each other, and so do rounds. A forked process may not.
 """
 
 import logging
+import os
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -29,7 +32,7 @@ from cairn_client.replica.replica_state import ReplicaState
 from cairn_client.replica.replica_store import ReplicaStore
 from cairn_client.robot.alignment import STEP_M, STEP_RAD, align_points, points_of_scans
 from cairn_client.robot.alignment_verdict import Alignment
-from cairn_client.robot.amending import Amending, AnyCommit
+from cairn_client.robot.amending import Amending, AnyCommit, facts_of_measurement
 from cairn_client.robot.kept_scans import KeptScans
 from cairn_client.robot.membership import Membership, bind_token
 from cairn_client.robot.robot_events import SIZE, Committed, Events, EventStream
@@ -58,6 +61,8 @@ log = logging.getLogger(__name__)
 
 FLUSH_S = 60.0
 """Seconds that `close` may push before it leaves the rest for the next time."""
+FOLDED_WITHIN_S = 60.0
+"""Seconds that `sync(until_folded=True)` waits for the server's map."""
 
 
 class Robot:
@@ -119,6 +124,7 @@ class Robot:
         self._integrator = integrator or Integrator()
         self._profile = LINKS[link]
         self._stay, self._is_closed = stay, False
+        self._pid, self._lock = os.getpid(), threading.RLock()
         self.returns = ReturnCounts()
         """Count of the pixels of the measurements that were closed, by what became of them."""
         self._status = OwnStatus(every_s=self._profile.tell_every_s)
@@ -256,6 +262,7 @@ class Robot:
         Args:
             model: sensor model to read the evidence under; None: the map's own, which the server states.
         """
+        self._check_open()
         return self._replica.snapshot(model)
 
     def events(self, *, size: int = SIZE) -> EventStream:
@@ -295,6 +302,9 @@ class Robot:
         # A snapshot, because a round in the background may change the view during the search.
         return align_points(self.snapshot(), points, T_map_robot=T_map_robot, reach_m=reach_m, reach_rad=reach_rad)
 
+    def __repr__(self) -> str:
+        return f"Robot({self.name} on map {self._map_name}, {self.mode}, {self.waiting} commits wait)"
+
     def observe(self, scan: Scan) -> None:
         """Add a scan to the open measurement.
 
@@ -305,9 +315,10 @@ class Robot:
         if self._measurement is None:
             raise BadInputError("no_rig", "this robot was opened without a rig, so it cannot read scans")
         # The measurement first: it refuses what does not fit, before anything else has the scan.
-        self._measurement.add(scan)
-        self._kept_scans.add(scan)
-        self._status.place_at(self._measurement.poses[-1])
+        with self._lock:
+            self._measurement.add(scan)
+            self._kept_scans.add(scan)
+            self._status.place_at(self._measurement.poses[-1])
 
     def mount(self, rig: Rig) -> None:
         """Mount another head, whose scans come from here on.
@@ -317,16 +328,18 @@ class Robot:
         """
         self._check_open()
         _check_kinds(rig, self.mode)
-        # A commit names one rig, by which an operator can retract it: scans of two heads must not share one.
-        if self._measurement is not None and len(self._measurement):
-            raise BadInputError("open_measurement", "commit or discard the scans of the old head first")
-        self._rig = rig
-        self._measurement = self._new_measurement()
+        with self._lock:
+            # A commit names one rig, by which an operator can retract it: scans of two heads must not share one.
+            if self._measurement is not None and len(self._measurement):
+                raise BadInputError("open_measurement", "commit or discard the scans of the old head first")
+            self._rig = rig
+            self._measurement = self._new_measurement()
 
     def discard(self) -> None:
         """Forget the scans since the last commit."""
-        self._measurement = self._new_measurement()
-        self._kept_scans.drop_measurement()
+        with self._lock:
+            self._measurement = self._new_measurement()
+            self._kept_scans.drop_measurement()
 
     def commit(
         self,
@@ -350,7 +363,8 @@ class Robot:
                 and nothing is left to drop. The measurement stays open in any case.
         """
         self._check_open()
-        return self._commit(note, retracts, profile, remember)
+        with self._lock:
+            return self._commit(note, retracts, profile, remember)
 
     def _commit(
         self, note: str, retracts: tuple[CommitId, ...], profile: Profile | None, remember: Mapping[str, str]
@@ -361,7 +375,7 @@ class Robot:
         # No evidence is no commit, except to take others out.
         if not diff and not retracts:
             if self._measurement:
-                log.warning("%d scans gave no evidence; nothing is committed", len(self._measurement))
+                log.warning("%d scans gave no evidence, nothing is committed: %s", len(self._measurement), counts)
                 self.returns += counts
                 self.discard()
             return None
@@ -405,9 +419,11 @@ class Robot:
             DamagedDataError: the disk damaged the scans.
             UnreachableError: kind `store_failed`: the disk is full or broken. In all cases nothing was changed.
         """
-        return self._amending().amend(
-            measurement, T_map_rig, T_map_observed=T_map_observed, note=note, profile=profile or self._profile.commits
-        )
+        profile = profile or self._profile.commits
+        with self._lock:
+            return self._amending().amend(
+                measurement, T_map_rig, T_map_observed=T_map_observed, note=note, profile=profile
+            )
 
     def amend_all(
         self, T_map_rig: Mapping[CommitId | str, npt.ArrayLike], *, note: str = "", profile: Profile | None = None
@@ -422,17 +438,51 @@ class Robot:
         Raises:
             CairnError: as `amend`; except for `no_scans` and `taken_back`, the amends before the failed one were made.
         """
-        return self._amending().amend_all(T_map_rig, note=note, profile=profile or self._profile.commits)
+        with self._lock:
+            return self._amending().amend_all(T_map_rig, note=note, profile=profile or self._profile.commits)
 
-    def sync(self, *, on_push: Callable[[CommitId], None] | None = None) -> RoundReport:
-        """One round with the server: push, then fetch what is missing.
+    def retract(self, measurement: AnyCommit, *, note: str = "") -> Commit:
+        """Take a past measurement back: its evidence leaves this map at once, and all others as they sync.
+
+        The open measurement stays open. Operators take back anybody's commits: `cairn map retract`.
+
+        Args:
+            measurement: commit of the measurement, or any amend of it: the latest one is taken back.
+            note: up to 1024 characters for the map's log, such as the reason.
 
         Raises:
-            UnreachableError: no link; try again later, nothing is lost.
+            ConflictError: kind `taken_back`: it was taken back before.
+            BadInputError: it is not this robot's, or the note is too long.
+            UnreachableError: kind `store_failed`: the disk is full or broken.
+        """
+        with self._lock:
+            return self._amending().retract(measurement, note=note)
+
+    def sync(
+        self,
+        *,
+        on_push: Callable[[CommitId], None] | None = None,
+        until_folded: bool = False,
+        within_s: float = FOLDED_WITHIN_S,
+    ) -> RoundReport:
+        """One round with the server: push, then fetch what is missing; `is_up_to_date` of its report says if all is.
+
+        The server adds commits to its map after it took them, mostly within a second: after one round, others may not
+        see the newest of them yet.
+
+        Args:
+            on_push: called with each commit that the server has for good.
+            until_folded: do rounds until one finds all own commits, but those that the server refuses, in the map.
+            within_s: how long to do so at most, seconds.
+
+        Raises:
+            UnreachableError: no link; or kind `not_folded`: not in that time. Try again later, nothing is lost.
             CairnError: the server refuses this robot, or its data is damaged.
         """
         self._check_open()
-        return self._rounds.sync(on_push)
+        return (
+            self._rounds.sync_until_folded(on_push, within_s=within_s) if until_folded else self._rounds.sync(on_push)
+        )
 
     def start_sync(self, *, every_s: float = 5.0) -> None:
         """Sync in the background: after each commit, and at least every so many seconds while there is a link."""
@@ -460,8 +510,8 @@ class Robot:
             stay: only pause: do not deregister.
             flush_s: how long to push at most, seconds; a round in the background is cut after two.
         """
-        if self._is_closed:
-            return
+        if self._is_closed or os.getpid() != self._pid:
+            return  # a process that was forked from the robot's leaves all as it is
         # Before anything can fail: `close` by hand and again by `with` pushes once.
         self._is_closed = True
         try:
@@ -486,6 +536,12 @@ class Robot:
 
     def _check_open(self) -> None:
         # One error for all, before the closed store or link would raise one of their own.
+        if os.getpid() != self._pid:
+            raise BadInputError(
+                "robot_forked",
+                f"robot {self.name} was opened by process {self._pid}, from which this one was forked: its folder and "
+                'its link are that one\'s. Open it after the fork, or start processes with "spawn"',
+            )
         if self._is_closed:
             raise BadInputError("robot_closed", f"robot {self.name} is closed: open it again with Robot(...)")
 
@@ -507,16 +563,9 @@ class Robot:
 
     def _facts(self, measurement: Measurement | None, note: str, retracts: tuple[CommitId, ...] = ()) -> CommitFacts:
         """Statements of a measurement's commit about itself."""
-        # By its rig and its times an operator finds the commit again, to retract what a bad calibration made.
-        return CommitFacts(
-            captured_s=measurement.captured_s if measurement else None,
-            scans=tuple(measurement.poses) if measurement else (),
-            sensors=tuple(self._rig.cameras) if self._rig else (),
-            rig=self._rig.digest() if self._rig else None,
-            integrator=str(self._integrator),
-            retracts=retracts,
-            note=note,
-        )
+        if measurement is None:
+            return CommitFacts(integrator=str(self._integrator), retracts=retracts, note=note)
+        return facts_of_measurement(measurement, note=note, retracts=retracts)
 
 
 def _check_kinds(rig: object, mode: object) -> None:

@@ -9,6 +9,7 @@ The background thread does a round after each wake-up, one every so often, and a
 
 import logging
 import threading
+import time
 from collections.abc import Callable
 
 from cairn_client.http.api import MapApi
@@ -35,6 +36,9 @@ log = logging.getLogger(__name__)
 OnPush = Callable[[CommitId], None]
 
 
+FIRST_LOOK_S, LONGEST_LOOK_S = 0.05, 1.0
+"""Pauses between rounds that look whether the server has folded; each is twice the one before."""
+RETRY_S = 30.0
 ROUND_END_S = 2.0
 """Seconds that a round may go on by itself when the thread is to stop, before it is cut."""
 
@@ -152,6 +156,25 @@ class Rounds:
             self._watch.failed(exc, None)
             raise
 
+    def sync_until_folded(self, on_push: OnPush | None, *, within_s: float) -> RoundReport:
+        """Do rounds until one finds all own commits in the server's map; raises what `Robot.sync` does."""
+        end_s, pause_s = time.monotonic() + within_s, FIRST_LOOK_S
+        while True:
+            report = self.sync(on_push)
+            # Commits that the server refuses wait for ever: only those that it took can be waited for.
+            if not report.has_more and not report.pending and report.waiting <= len(report.refused):
+                return report
+            if time.monotonic() > end_s:
+                raise UnreachableError(
+                    "not_folded",
+                    f"after {within_s:g} s the server's map lacks {report.pending + report.waiting} own commits still; "
+                    "nothing is lost, sync again later",
+                    retry_after_s=RETRY_S,
+                )
+            if not report.has_more:
+                time.sleep(pause_s)
+                pause_s = min(2 * pause_s, LONGEST_LOOK_S)
+
     def start(self, *, every_s: float) -> None:
         """Do rounds in the background, if there are none yet."""
         if self._thread is None:
@@ -207,6 +230,8 @@ class Rounds:
         pushes = self._push(on_push)
         report = self._fetch()
         report.add_pushes(pushes)
+        if self._mode != "viewer":
+            report.waiting, report.pending = self._replica.behind()
         # Then others' commits, and the status, which costs nothing if it is lost.
         if self._carrier is not None:
             self._carrier.exchange()

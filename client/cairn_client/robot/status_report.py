@@ -4,6 +4,7 @@ A robot whose status does not change sends it once a minute, and not with every 
 """
 
 import logging
+import math
 import time
 from dataclasses import dataclass
 
@@ -17,6 +18,8 @@ from cairn_map.wire.messages import Mode, RobotStatus
 
 log = logging.getLogger(__name__)
 
+STEP_M, SPEED_M_PER_S = 10.0, 100.0
+"""Step between two scans and its speed, both of which a doubted step exceeds."""
 TELL_AGAIN_S = 60.0
 """Seconds after which a status that did not change is sent again."""
 
@@ -34,10 +37,22 @@ class OwnStatus:
     every_s: float = 0.0
     """Least seconds between two reports, whatever is new."""
     _sent: RobotStatus | None = None
+    _scan: ScanPose | None = None
+    """Pose of the last scan."""
 
     def place_at(self, pose: ScanPose) -> None:
-        """Note the pose of the newest scan."""
-        self.pose = pose
+        """Note the pose of the newest scan; a step that no robot makes is logged, and taken as it is."""
+        before, self._scan, self.pose = self._scan, pose, pose
+        if before is None:
+            return
+        step_m, time_s = math.dist(before.t_map_rig, pose.t_map_rig), pose.time_s - before.time_s
+        if step_m > STEP_M and step_m > SPEED_M_PER_S * abs(time_s):
+            log.warning(
+                "T_map_rig moved %.1f m in %.3g s from one scan to the next: is it in metres, and of the same frame? "
+                "The scan is taken as it is",
+                step_m,
+                time_s,
+            )
 
     def place(self) -> tuple[float, float, float] | None:
         """Position of the robot, metres, map frame; None if it is unknown."""

@@ -65,8 +65,10 @@ class Exchange:
         self._replica = replica
         with replica.changing() as base:  # author and cursors are of one instant
             self._author = replica.author
+            self._held = replica.header
             self._default = base.default_cursor
             self._asked = {key: cell.cursor for key, cell in base.cells.items() if is_within(key, box)}
+        self._since = self._stated_since()
         # The request's bounds.
         self._compare = compare
         self._box = box
@@ -102,7 +104,14 @@ class Exchange:
             box=self._box,
             size_bytes_max=self._reply_bytes_max,
             near=self._near,
+            since=self._since,
         )
+
+    def _stated_since(self) -> str | None:
+        """State of the header held, whose vector need not come again; shortly where all cells stand there."""
+        if self._held is None:
+            return None
+        return "cursor" if self._default is not None and self._held.to == str(self._default) else self._held.to
 
     def take(self, frame: Frame) -> None:
         """Apply one frame of the answer.
@@ -113,9 +122,10 @@ class Exchange:
         # One frame in one hold of the lock: other threads commit between two frames, never within one.
         with self._replica.changing() as base:
             if isinstance(frame, ReplyHeader):
-                self._header = frame
-                self._coverage = frame.coverage
-                self._replica.take_header(frame, asked_by=self._author)
+                # Rule 6: coverage is of all ids, so what was held at `since` is part of it.
+                self._header = frame.whole(self._held, since=self._since)
+                self._coverage = self._header.coverage
+                self._replica.take_header(self._header, asked_by=self._author)
             elif self._header is None:
                 raise DamagedDataError("bad_frame", "a reply must begin with its header")
             elif isinstance(frame, More):

@@ -23,7 +23,7 @@ from cairn_map.commits.ids import Author, CommitId
 from cairn_map.errors import BadInputError, CairnError, DamagedDataError, UnreachableError
 from cairn_map.evidence.grid import Cell, CellKey, cell_of_key
 from cairn_map.wire.frames import Frame
-from cairn_map.wire.messages import INDEX_PAGE, CellIndex, MissingRequest, Upload
+from cairn_map.wire.messages import INDEX_PAGE, CellIndex, MissingRequest, ReplyHeader, Upload
 
 A = TypeVar("A")
 T = TypeVar("T")
@@ -129,6 +129,8 @@ class GetIndex(Ask[CellIndex]):
     box: Box | None = None
     after: Cell | None = None
     """The last cell of the page before."""
+    held: ReplyHeader | None = None
+    """Header of an earlier state, whose vector need not come again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +149,9 @@ class PutCell(Ask[None]):
     body: bytes
 
 
-def whole_index(author: Author | None = None, *, box: Box | None = None) -> Conversation[MapIndex]:
+def whole_index(
+    author: Author | None = None, *, box: Box | None = None, held: ReplyHeader | None = None
+) -> Conversation[MapIndex]:
     """Index of all cells, page by page, under the header of the first page.
 
     An entry whose `lm` is above the header's cursor changed between two pages.
@@ -157,12 +161,12 @@ def whole_index(author: Author | None = None, *, box: Box | None = None) -> Conv
         DamagedDataError: kind `bad_message`: the cells do not rise in number, so the pages might never end.
         BadInputError: kind `too_large`: more than `INDEX_CELLS_MAX` cells.
     """
-    page = yield from GetIndex(author, box)
+    page = yield from GetIndex(author, box, held=held)
     header, start = page.header, page.header.to_cursor
     tables = [listed_page(page.cells)]
     count, last_key = len(page.cells), _last_key(tables[0], after=None)
     while len(page.cells) >= INDEX_PAGE and last_key is not None:
-        page = yield from GetIndex(author, box, after=cell_of_key(last_key))
+        page = yield from GetIndex(author, box, after=cell_of_key(last_key), held=held)
         to = page.header.to_cursor
         if to.log_id != start.log_id or to.seq < start.seq:
             raise UnreachableError("no_end", "the server's map was replaced while its cells were listed")

@@ -4,6 +4,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any
+from unicodedata import category
 
 from pydantic import FailFast, TypeAdapter, ValidationError
 
@@ -28,8 +29,8 @@ KIND = re.compile(r"[a-z][a-z_]{0,63}")
 DETAIL_LENGTH_MAX = 1000
 """Characters of a problem's detail: PROTOCOL.md 6."""
 BREAKS = re.compile("[\n\v\f\r\x1c-\x1e\x85\u2028\u2029]+")
-CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]")
-"""Control characters but tab and line feed, and marks that turn the direction of writing."""
+STEERING = frozenset({"Cc", "Cf", "Co", "Cs", "Zl", "Zp"})
+"""Unicode's categories of what steers or does not show: control, format, private use, halves of pairs, line ends."""
 
 
 @dataclass(slots=True)
@@ -99,8 +100,10 @@ def error_of(status: int, retry_after: str, body: bytes) -> CairnError:
 
 
 def shown_text(text: str) -> str:
-    """A text of another program as it may be shown: without characters that a terminal would obey."""
-    return CONTROLS.sub("\N{REPLACEMENT CHARACTER}", text)
+    """A text of another program as it may be shown: without characters that a terminal would obey, or that hide."""
+    return "".join(
+        char if char in "\t\n" or category(char) not in STEERING else "\N{REPLACEMENT CHARACTER}" for char in text
+    )
 
 
 def one_line(text: str) -> str:

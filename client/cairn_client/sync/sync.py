@@ -70,6 +70,15 @@ class RoundReport:
     """True if the round ended at its limit of bytes: the next one goes on."""
     healed: int = 0
     """Cells that the server had damaged and received from here."""
+    waiting: int = 0
+    """Own commits that the server lacks still: those that it refused, and those of a measurement since."""
+    pending: int = 0
+    """Own commits that the server has, and that its map does not hold yet; the next round may find them there."""
+
+    @property
+    def is_up_to_date(self) -> bool:
+        """True if the server's map holds all commits of this robot, and the robot all that the map held then."""
+        return not (self.has_more or self.waiting or self.pending)
 
     def add_pushes(self, pushes: "RoundReport") -> None:
         """Take over the counts of the round's pushes."""
@@ -308,7 +317,7 @@ def fetch_cells(
     """
     report = RoundReport()
     author = replica.author
-    index = yield from whole_index(author, box=box)
+    index = yield from whole_index(author, box=box, held=replica.header)
     to, coverage = index.header.to_cursor, index.header.coverage
     # What the index alone settles: cells that did not change move along, and cells that are gone are emptied.
     with replica.changing() as base:

@@ -11,11 +11,25 @@ from statistics import median
 
 import numpy as np
 
+from cairn_map.evidence.grid import BRICK_DEPTH, DEPTH_MAX, Geometry, geometry_for
 from cairn_sim.evaluation.scores import Scores
 
+PAPER_CELL_UM = 5_120_000
+"""Edge of the paper's cells at every resolution, micrometres."""
 PAPER_VOXEL_BYTES = 8
 """Bytes of a voxel in the paper's uncompressed cube: 16 MB for 128^3 voxels (Table 3)."""
 Json = dict[str, object]
+
+
+def paper_geometry(voxel_edge_m: float) -> Geometry:
+    """Geometry with the paper's cells: 256^3 voxels at 2 cm, where the standard ones of this size are of 128^3.
+
+    Raises:
+        BadInputError: the voxel edge is not 1 mm to 1 m.
+    """
+    geometry = geometry_for(voxel_edge_m=voxel_edge_m)
+    depth = min(DEPTH_MAX, max(BRICK_DEPTH, (PAPER_CELL_UM // geometry.voxel_edge_um).bit_length() - 1))
+    return Geometry(voxel_edge_um=geometry.voxel_edge_um, depth=depth)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

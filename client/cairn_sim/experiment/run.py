@@ -20,11 +20,18 @@ from importlib.metadata import version
 from pathlib import Path
 
 from cairn_map.errors import BadInputError
-from cairn_map.evidence.grid import Geometry, geometry_for
+from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.progress import with_progress
 from cairn_sim.experiment.cells import measure_cells
-from cairn_sim.experiment.figures import CellFigures, Json, ResolutionFigures, RunFigures, TruthFigures
+from cairn_sim.experiment.figures import (
+    CellFigures,
+    Json,
+    ResolutionFigures,
+    RunFigures,
+    TruthFigures,
+    paper_geometry,
+)
 from cairn_sim.experiment.mapping import GrowingMap, map_all
 from cairn_sim.experiment.plan import PlanView
 from cairn_sim.experiment.report import report_page
@@ -55,7 +62,7 @@ def run_experiment(robots: Sequence[ExperimentRobot], folder: Path, settings: Ex
         BadInputError: the folder holds something, the robots saw nothing, or a measurement does not fit a commit.
     """
     edges_m = sorted(set(settings.voxel_edges_m), reverse=True)
-    maps = [GrowingMap(geometry_for(voxel_edge_m=edge_m)) for edge_m in edges_m]
+    maps = [GrowingMap(paper_geometry(edge_m)) for edge_m in edges_m]
     _check_folder(folder)
     started = datetime.now(UTC)
     taken_s = _drive(robots, maps, settings.threads)

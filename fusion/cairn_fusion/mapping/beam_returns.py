@@ -3,10 +3,12 @@
     range_m    a hit each              without flying and saturated pixels and the robot's own body, within limits
     shield_m   nearest range           with flying pixels and the body: a neighbour may have seen a part of it
     silent     beams without a return  where the rig states that no return means empty space
+    missing    beams without a return  where it does not: they have no information of their own
 
-A pixel in none of the three has no information. The rig's range bias is subtracted first. Beams are clear up to
+A pixel in none of the four has no information. The rig's range bias is subtracted first. Beams are clear up to
 
-    carved images    nearest neighbour - max(1 voxel, k sigma)      `clear_kernels`: edges and slants widen it
+    carved images    nearest neighbour - max(1 voxel, k sigma)      `clear_kernels`: edges and slants widen it;
+                                                                    gaps of one or two missing pixels are bridged
     single beams     range - max(1 voxel, k sigma)                  lidars: their neighbours are far apart
     silent beams     `no_return_clears_m`, where the rig states it
 """
@@ -21,7 +23,7 @@ from cairn_calib.rig.body import Body
 from cairn_calib.rig.poses import Transform, inverse, transform_points
 from cairn_calib.rig.rig import MountedCamera, Rig
 from cairn_fusion.mapping.brick_tally_kernels import returned_points
-from cairn_fusion.mapping.clear_kernels import nearest_around
+from cairn_fusion.mapping.clear_kernels import bridge_gaps_into, nearest_around
 from cairn_fusion.mapping.flying_kernels import flying_pixels
 from cairn_fusion.recording.scan import Scan, check_scan
 from cairn_map.arrays import Flags, Floats, Singles
@@ -57,6 +59,13 @@ class ReturnCounts:
         """Count of all pixels."""
         return sum(getattr(self, one.name) for one in fields(self))
 
+    def __str__(self) -> str:
+        """Such as `0 of 4800 pixels used, 4800 too far`."""
+        causes = [(getattr(self, one.name), one.name.replace("_", " ")) for one in fields(self)[1:]]
+        return ", ".join(
+            [f"{self.used} of {self.pixels} pixels used", *(f"{count} {cause}" for count, cause in causes if count)]
+        )
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Returns:
@@ -71,6 +80,8 @@ class Returns:
     """(H, W) true where nothing came back although the camera sees any surface within `silent_m`."""
     silent_m: float
     """Clear length of silent beams, metres."""
+    missing: Flags
+    """(H, W) true where nothing came back and the rig does not say what that means."""
     pixels: npt.NDArray[np.int32]
     """(N,) numbers of the pixels with a range, row by row."""
     points_map: Floats
@@ -116,6 +127,7 @@ def returns_of(
     # Silence means empty space only where the rig states it, and not where too much light returned.
     silent_m = min(mounted.known_sensing.no_return_clears_m or 0.0, max_range_m)
     silent = void & ~full & (silent_m > 0)
+    missing = void & ~full & (silent_m == 0)
     if rig.body is not None:
         T_body_tof = mounted.transform if scan.T_map_body is None else inverse(scan.T_map_body) @ T_map_tof
         within &= ~_on_body(rig.body, np.where(within, true_m, np.float32(np.nan)), mounted, T_body_tof)
@@ -134,7 +146,7 @@ def returns_of(
         flying=limited - whole,
         own_body=whole - len(pixels),
     )
-    return Returns(T_map_tof, range_m, shield_m, silent, silent_m, pixels, points_map, counts)
+    return Returns(T_map_tof, range_m, shield_m, silent, silent_m, missing, pixels, points_map, counts)
 
 
 def full_pixels(scan: Scan, mounted: MountedCamera) -> Flags:
@@ -158,9 +170,13 @@ def margins_m(sigma_m: Floats, *, voxel_edge_m: float, noise_sigmas: float) -> F
 
 def clear_image(returns: Returns, mounted: MountedCamera, *, voxel_edge_m: float, noise_sigmas: float) -> Singles:
     """(H, W) clear range of each pixel of an image without gaps between its pixels, metres; 0 for unknown."""
+    seen_m, shield_m = np.where(returns.silent, np.float32(np.inf), returns.range_m), returns.shield_m
+    if returns.missing.any():
+        shield_m = shield_m.copy()
+        bridge_gaps_into(seen_m, shield_m, returns.missing)
     nearest_m, share = nearest_around(
-        np.where(returns.silent, np.float32(np.inf), returns.range_m),
-        returns.shield_m,
+        seen_m,
+        shield_m,
         returns.silent_m,
         float(max(mounted.camera.focal_px)),
         voxel_edge_m,

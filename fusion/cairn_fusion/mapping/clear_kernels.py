@@ -8,7 +8,9 @@ pixel between two surfaces may have mixed them:
           x    shielded            mixed: its range is anything between
              o---o    free         far
 
-Neighbours without a range do not count.
+Neighbours without a range do not count. A gap of one or two pixels to which nothing came back is first bridged by the
+nearer of the ranges on both its sides (`bridge_gaps_into`): images that were resampled to another camera's have such
+gaps all over, in rows and columns.
 """
 
 import math
@@ -17,8 +19,12 @@ import numba as nb
 import numpy as np
 
 from cairn_fusion.transfer.transfer_kernels import step_beside
-from cairn_map.arrays import Singles
+from cairn_map.arrays import Flags, Singles
 
+GAP_PX = 2
+BRIDGE_STEP_M = 1.0
+"""Pixels of a gap that two ranges bridge, at most, and the largest difference of the two: a wider gap may be a thing
+from which nothing comes back, and at a greater step either end would be a guess."""
 RINGS = 2
 EDGE_STEP_M = 0.1
 SLANT_SHARE = 1.5
@@ -28,6 +34,70 @@ EDGE_SHARE = 1.0
 GRAZING_SHARE = 0.4
 GRAZING_MAX = 3.0
 """A margin is at least 0.4 of itself across the surface, but never more than 3 times as long along the beam."""
+
+
+@nb.njit(cache=True, nogil=True)
+def bridge_gaps_into(seen_m: Singles, shield_m: Singles, missing: Flags) -> None:
+    """Give pixels of narrow gaps the nearer of the two ranges at its ends: along rows, and then along columns.
+
+    A gap is at most `GAP_PX` pixels of `missing` in a row, with ranges at both ends that differ by at most
+    `BRIDGE_STEP_M`. Between rows that were bridged
+    the second pass finds ranges where whole rows are missing.
+
+    Args:
+        seen_m: (H, W) ranges of pixels that may clear, NaN for none; changed.
+        shield_m: (H, W) nearest range in a pixel, NaN for none; changed where `seen_m` is.
+        missing: (H, W) true where nothing came back.
+    """
+    height, width = seen_m.shape
+    # Stage 1: what each pixel says, with a border that says nothing: a range, infinite where missing, else nothing.
+    # Nothing is -1, so that the lesser of two ends is known only if both are, and a missing pixel never is an end.
+    ends = np.full((height + 2 * GAP_PX, width + 2 * GAP_PX), np.float32(-1.0))
+    for y in range(height):
+        _ends_of_row_into(ends[y + GAP_PX, GAP_PX:], seen_m[y], missing[y])
+    # Stage 2: along rows.
+    for y in range(height):
+        row = ends[y + GAP_PX]
+        _bridge_row_into(seen_m[y], shield_m[y], row, row[1:], row[2:], row[3:], row[4:])
+    # Stage 3: along columns, all of a row at once. Only what the rows gave counts: `ends` is not written meanwhile.
+    for y in range(height):
+        _ends_of_row_into(ends[y + GAP_PX, GAP_PX:], seen_m[y], missing[y])
+    for y in range(height):
+        far, near, here, next1, next2 = ends[y], ends[y + 1], ends[y + 2], ends[y + 3], ends[y + 4]
+        _bridge_row_into(seen_m[y], shield_m[y], far[2:], near[2:], here[2:], next1[2:], next2[2:])
+
+
+@nb.njit(cache=True, nogil=True)
+def _ends_of_row_into(ends: Singles, seen_m: Singles, missing: Flags) -> None:
+    """Ranges of a row, infinite where a pixel is missing and -1 where it has no range for another reason."""
+    for x in range(len(seen_m)):
+        other = np.float32(np.inf) if missing[x] else np.float32(-1.0)
+        ends[x] = seen_m[x] if seen_m[x] > np.float32(0.0) else other
+
+
+@nb.njit(cache=True, nogil=True)
+def _bridge_row_into(
+    seen_m: Singles,
+    shield_m: Singles,
+    before2: Singles,
+    before: Singles,
+    here: Singles,
+    after: Singles,
+    after2: Singles,
+) -> None:
+    """Bridge the gaps of one pixel, and of two, that the pixels of a row lie in; `GAP_PX` is 2."""
+    none, endless, step = np.float32(0.0), np.float32(np.inf), np.float32(BRIDGE_STEP_M)
+    for x in range(len(seen_m)):
+        # The end on each side: the next pixel, or behind one that is missing the second.
+        short0, short1 = before[x] < endless, after[x] < endless
+        low = before[x] if short0 else before2[x]
+        high = after[x] if short1 else after2[x]
+        nearer = low if low < high else high
+        # Not both ends two pixels away, which is a gap of three. Two endless ends have no difference: NaN.
+        is_narrow = (here[x] == endless) & (short0 | short1)
+        bridged = is_narrow & (nearer > none) & (abs(high - low) <= step)
+        seen_m[x] = nearer if bridged else seen_m[x]
+        shield_m[x] = nearer if bridged else shield_m[x]
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")

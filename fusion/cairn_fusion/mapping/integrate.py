@@ -12,11 +12,13 @@ never on the map, nor on the order or the threads in which scans are added.
 
 import math
 import os
+import re
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import StrEnum
 from threading import Lock
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -28,13 +30,16 @@ from cairn_fusion.mapping.brick_tally import Each, TallyPool
 from cairn_fusion.mapping.free_space import Window, carving_of, window_of
 from cairn_fusion.mapping.ray_casting import beam_evidence, clear_ends, silent_ends
 from cairn_fusion.mapping.samples import sample_sums
-from cairn_fusion.recording.scan import Scan
+from cairn_fusion.recording.scan import Scan, check_scan
 from cairn_fusion.transfer.transfer import DEPTH_TOLERANCE_M
 from cairn_map.arrays import Floats, Ints
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.evidence import Evidence, packed_evidence
 from cairn_map.evidence.grid import CellKey, Geometry, split_voxels, voxels_of_points
+
+FIELD = re.compile(r"(\w+)=(\S+)")
+"""Number of an integrator, as its text states it."""
 
 
 class Method(StrEnum):
@@ -87,18 +92,32 @@ class Integrator:
                 raise BadInputError("bad_range", f"{name} must be above 0, got {getattr(self, name)}")
 
     def __str__(self) -> str:
-        # The text goes into every commit, so that evidence can be found by how it was made; 5 is the version of the
+        # The text goes into every commit, so that evidence can be found by how it was made; 6 is the version of the
         # integrator.
         farthest = "usual" if self.max_range_m is None else f"{self.max_range_m:g}"
         limits = f"min_range_m={self.min_range_m:g} max_range_m={farthest}"
         surfaces = f"flying_step_m={self.flying_step_m:g} noise_sigmas={self.noise_sigmas:g}"
         samples = f"sample_spread_voxels={self.sample_spread_voxels:g} temperature_step_k={self.temperature_step_k:g}"
         samples += f" hidden_behind_m={self.hidden_behind_m:g}"
-        return f"cairn-{self.method} 5 {limits} {surfaces} {samples}"
+        return f"cairn-{self.method} 6 {limits} {surfaces} {samples}"
 
     def reach_m(self, mounted: MountedCamera) -> float:
         """Greatest range of a return of this range camera, metres."""
         return mounted.usual_reach_m if self.max_range_m is None else self.max_range_m
+
+
+def integrator_from_text(text: str) -> Integrator | None:
+    """The integrator that a commit states, its numbers to six digits; None if it states none."""
+    stated = dict(FIELD.findall(text))
+    values: dict[str, Any] = {}
+    try:
+        values["method"] = Method(text.partition(" ")[0].removeprefix("cairn-"))
+        for one in fields(Integrator):
+            if stated.get(one.name, "usual") != "usual":
+                values[one.name] = float(stated[one.name])
+        return Integrator(**values)
+    except (ValueError, BadInputError):
+        return None
 
 
 class Integration:
@@ -123,6 +142,9 @@ class Integration:
             BadInputError: an image does not fit its camera, the scan names a channel that the map lacks, or reaches
                 beyond the numbered space; nothing was added.
         """
+        if scan.points_m is not None:
+            self._add_sweep(scan, scan.points_m)
+            return
         limits, rig, camera = self._integrator, self._rig, self._rig[scan.range_camera].camera
         # A camera with an image plane is carved through it; a lidar, or method CAST, goes ray by ray.
         window = window_of(camera) if limits.method is Method.CARVE else None  # pyright: ignore[reportArgumentType]
@@ -174,10 +196,13 @@ class Integration:
         # Points without a bias, within limits, and not on the robot itself; NaN is outside all limits.
         own = (points if of is None else of.true_points(points)).astype(np.float64)
         range_m = np.linalg.norm(own, axis=1)
+        void, near = ~(range_m > 0), range_m < self._integrator.min_range_m
         farthest_m = LIDAR_REACH_M if self._integrator.max_range_m is None else self._integrator.max_range_m
         if of is not None:
             farthest_m = self._integrator.reach_m(of)
-        kept = (range_m >= self._integrator.min_range_m) & (range_m <= farthest_m)
+        far = range_m > farthest_m
+        kept = ~(void | near | far)
+        limited = int(np.count_nonzero(kept))
         if self._rig.body is not None and T_map_body is not None:
             T_body_sensor = inverse(check_transform(T_map_body, name="T_map_body")) @ T
             kept &= ~self._rig.body.holds(transform_points(T_body_sensor, own))
@@ -186,10 +211,28 @@ class Integration:
         points_map = transform_points(T, own[kept])
         clear_m = self._clear_ends(T[:3, 3], points_map, sigma_m)
         self._tallies.merge(beam_evidence(T[:3, 3], points_map, clear_m, self._geometry, sums_of=self._no_sums))
+        counts = ReturnCounts(
+            used=len(points_map),
+            no_return=int(np.count_nonzero(void)),
+            too_near=int(np.count_nonzero(near & ~void)),
+            too_far=int(np.count_nonzero(far)),
+            own_body=limited - len(points_map),
+        )
+        with self._lock:
+            self.counts += counts
 
     def diff(self, each: Each = map) -> dict[CellKey, Evidence]:
         """The evidence of all scans, by cell; `each` as for `Tally.packed`. Not while scans are being added."""
         return self._tallies.packed(each)
+
+    def _add_sweep(self, scan: Scan, points: npt.NDArray[np.float32]) -> None:
+        """Add a scan whose points have no raster, ray by ray."""
+        check_scan(scan, self._rig)
+        scalars = _scalar_evidence(scan, self._geometry)
+        body = scan.T_map_rig if scan.T_map_body is None else scan.T_map_body
+        T_map_sensor = scan.T_map_rig @ self._rig[scan.range_camera].transform
+        self.add_points(points, T_map_sensor, range_camera=scan.range_camera, T_map_body=body)
+        self._tallies.merge(scalars)
 
     def _carve(self, scan: Scan, returns: Returns, window: Window) -> None:
         """Count hits where beams ended, misses where the image looks through."""

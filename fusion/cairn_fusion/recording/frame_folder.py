@@ -8,7 +8,8 @@ of its own.
 """
 
 import re
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from glob import escape
 from pathlib import Path, PurePosixPath
@@ -35,12 +36,21 @@ from cairn_fusion.recording.recording_format import (
     ThermalEncoding,
     path_inside,
 )
-from cairn_fusion.recording.timed_lists import read_text
+from cairn_fusion.recording.timed_lists import TimedList, read_text
 from cairn_map.errors import BadInputError
 
 TEXT_BYTES_MAX = 1 << 16
 """Largest text file with a matrix."""
 FRAME_ID = "{id}"
+IMAGE_GAP_S = 0.02
+"""Largest time between the depth image and another image of one frame, where names are times: half a frame at 25 Hz."""
+FOLDER_NAMES = {
+    "depth": ("depth", "depths", "depth_images", "d"),
+    "colour": ("rgb", "color", "colour", "image", "images", "visible"),
+    "thermal": ("thermal", "lwir", "infrared", "t"),
+}
+"""Names, in small letters, that publishers give the folders of images."""
+IMAGE_NAME = re.compile(r"(\D*)(.*[0-9].*)(\.png|\.jpg|\.jpeg)", re.IGNORECASE)
 FRAME_RANGE = re.compile(r"([0-9]{1,18})-([0-9]{1,18})")
 DECIMAL_SECONDS = re.compile(r"[0-9]{1,12}\.[0-9]{1,12}")
 NANOSECONDS = re.compile(r"[0-9]{16,19}")
@@ -112,11 +122,12 @@ def import_frames(
     root = Path(folder).resolve()
     ids = _frame_ids(root, options.depth)
     # Times count all frames of the folder, so that a choice of them keeps its times.
-    wanted = set(ids) if frames is None else _chosen(ids, frames, root)
+    wanted = set(ids) if frames is None else chosen_frames(ids, frames, root)
     chosen = [(n, frame_id) for n, frame_id in enumerate(ids) if frame_id in wanted]
     found = _frame_poses(root, options, chosen, poses)
+    images = {pattern: _Images(root, pattern) for pattern in (options.colour, options.thermal) if pattern is not None}
     files = tuple(
-        _scan_files(root, options, frame_id, time_s=_time_s(options, n, frame_id), T_map_rig=T)
+        _scan_files(root, options, frame_id, images, time_s=_time_s(options, n, frame_id), T_map_rig=T)
         for (n, frame_id), T in zip(chosen, found.poses, strict=True)
         if T is not None
     )
@@ -132,8 +143,9 @@ def import_frames(
         thermal_encodings={
             "thermal": ThermalEncoding(kelvin_per_count=options.kelvin_per_count, kelvin_at_zero=options.kelvin_at_zero)
         },
+        has_times=_has_times(options, ids[0]),
         rounding=found.rounding,
-        pose_notes=found.notes,
+        pose_notes=(*found.notes, *(note for one in images.values() for note in one.notes(len(files)))),
     )
 
 
@@ -149,10 +161,15 @@ def _frame_ids(root: Path, pattern: str) -> list[str]:
     ids = [match["id"] for match in matches if match]
     if not ids:
         raise BadInputError("no_frames", f"no file in {root} fits {pattern}")
-    return sorted(ids, key=lambda word: (0, int(word), word) if word.isdecimal() else (1, 0, word))
+    return sorted(ids, key=frame_order)
 
 
-def _chosen(ids: Sequence[str], frames: Sequence[str], root: Path) -> set[str]:
+def frame_order(frame_id: str) -> tuple[int, int, str]:
+    """Key by which frames are sorted: numbers by value, then other ids."""
+    return (0, int(frame_id), frame_id) if frame_id.isdecimal() else (1, 0, frame_id)
+
+
+def chosen_frames(ids: Sequence[str], frames: Sequence[str], root: Path) -> set[str]:
     """Those of the ids that are named, or lie in a range of numbers.
 
     Raises:
@@ -177,24 +194,78 @@ def _chosen(ids: Sequence[str], frames: Sequence[str], root: Path) -> set[str]:
     return chosen
 
 
-def _scan_files(
-    root: Path, options: FrameFolderOptions, frame_id: str, *, time_s: float, T_map_rig: Transform
-) -> ScanFiles:
-    def image(pattern: str) -> Path:
-        path = path_inside(root, pattern.replace(FRAME_ID, frame_id))
-        if not path.is_file():
-            raise BadInputError(
-                "missing_image", f"frame {frame_id} of {root} lacks {pattern.replace(FRAME_ID, frame_id)}"
-            )
-        return path
+def image_patterns(folder: Path) -> dict[str, str]:
+    """Patterns of the images in a folder whose own folders are named as publishers name them, by kind of image."""
+    patterns: dict[str, str] = {}
+    for path in sorted(folder.iterdir()):
+        kind = next((kind for kind, names in FOLDER_NAMES.items() if path.name.lower() in names), None)
+        if kind is None or kind in patterns or not path.is_dir():
+            continue
+        # The prefix and the suffix that most of the names have, such as `frame-` and `.png`.
+        parts = [match.groups() for one in path.iterdir() if (match := IMAGE_NAME.fullmatch(one.name))]
+        counts = Counter((prefix, suffix) for prefix, _, suffix in parts)
+        if counts:
+            (prefix, suffix), _ = counts.most_common(1)[0]
+            patterns[kind] = f"{path.name}/{prefix}{FRAME_ID}{suffix}"
+    return patterns
 
+
+class _Images:
+    """Images of one pattern: of a frame the one with its id, or, where ids are times, the nearest one."""
+
+    def __init__(self, root: Path, pattern: str) -> None:
+        self._root = root
+        self._pattern = pattern
+        self._by_time: TimedList[str] | None = None
+        self._missing = 0
+
+    def of(self, frame_id: str) -> Path | None:
+        """The image of a frame; None if names are times, and none is near.
+
+        Raises:
+            BadInputError: kind `missing_image`: names are no times, and there is none of this id.
+        """
+        path = path_inside(self._root, self._pattern.replace(FRAME_ID, frame_id))
+        if path.is_file():
+            return path
+        time_s = id_time_s(frame_id)
+        if time_s is None:
+            raise BadInputError(
+                "missing_image", f"frame {frame_id} of {self._root} lacks {self._pattern.replace(FRAME_ID, frame_id)}"
+            )
+        if self._by_time is None:
+            timed = sorted((t, one) for one in _frame_ids(self._root, self._pattern) if (t := id_time_s(one)))
+            self._by_time = TimedList(np.array([t for t, _ in timed]), tuple(one for _, one in timed))
+        near = self._by_time.nearest(time_s, max_gap_s=IMAGE_GAP_S)
+        self._missing += near is None
+        return None if near is None else path_inside(self._root, self._pattern.replace(FRAME_ID, near))
+
+    def notes(self, count: int) -> list[str]:
+        """Sentences about frames without an image, and about images that are only near."""
+        if self._by_time is None:
+            return []
+        text = f"{self._pattern}: of each frame the image nearest in time, at most {IMAGE_GAP_S:g} s away"
+        return [text + (f"; {self._missing} of {count} frames have none" if self._missing else "")]
+
+
+def _scan_files(
+    root: Path,
+    options: FrameFolderOptions,
+    frame_id: str,
+    images: Mapping[str, _Images],
+    *,
+    time_s: float,
+    T_map_rig: Transform,
+) -> ScanFiles:
+    colour = images[options.colour].of(frame_id) if options.colour else None
+    thermal = images[options.thermal].of(frame_id) if options.thermal else None
     return ScanFiles(
         time_s=time_s,
         T_map_rig=T_map_rig,
         range_camera="depth",
-        range_path=image(options.depth),
-        colour={"colour": image(options.colour)} if options.colour else {},
-        thermal={"thermal": image(options.thermal)} if options.thermal else {},
+        range_path=path_inside(root, options.depth.replace(FRAME_ID, frame_id)),
+        colour={} if colour is None else {"colour": colour},
+        thermal={} if thermal is None else {"thermal": thermal},
     )
 
 
@@ -230,8 +301,7 @@ def _frame_poses(
 
 def _frame_key(root: Path, options: FrameFolderOptions, n: int, frame_id: str) -> FrameKey:
     patterns = [pattern for pattern in (options.colour, options.depth, options.thermal) if pattern is not None]
-    # A made-up rate gives frames times that no pose file knows.
-    has_time = _id_time_s(frame_id) is not None or "frame_rate_hz" in options.model_fields_set
+    has_time = _has_times(options, frame_id)
     return FrameKey(
         label=f"frame {frame_id} of {root}",
         number=int(frame_id) if frame_id.isdecimal() else None,
@@ -240,12 +310,17 @@ def _frame_key(root: Path, options: FrameFolderOptions, n: int, frame_id: str) -
     )
 
 
+def _has_times(options: FrameFolderOptions, frame_id: str) -> bool:
+    """False if a made-up rate gives frames their times, which no pose file knows."""
+    return id_time_s(frame_id) is not None or "frame_rate_hz" in options.model_fields_set
+
+
 def _time_s(options: FrameFolderOptions, n: int, frame_id: str) -> float:
-    named_s = _id_time_s(frame_id)
+    named_s = id_time_s(frame_id)
     return options.start_time_s + n / options.frame_rate_hz if named_s is None else named_s
 
 
-def _id_time_s(frame_id: str) -> float | None:
+def id_time_s(frame_id: str) -> float | None:
     """The time that an id is: seconds with a point, or at least 16 digits of nanoseconds; else None."""
     if DECIMAL_SECONDS.fullmatch(frame_id):
         return float(frame_id)

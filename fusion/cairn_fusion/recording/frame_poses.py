@@ -113,6 +113,7 @@ class FramePoses:
     bad: BadRows
     lines: list[str] = field(default_factory=list)
     """Sentences about frames and poses without each other."""
+    _by_times: Trajectory | None = None
 
     @property
     def rounding(self) -> PoseRounding:
@@ -127,8 +128,7 @@ class FramePoses:
         """
         if self.options.max_gap_s is not None:
             max_gap_s = self.options.max_gap_s
-        by_time = self.file.key is KeyKind.TIME
-        found = self._by_time(frames, max_gap_s) if by_time else self._by_key(frames)
+        found = self._by_time(frames, max_gap_s) if self.is_by_time else self._by_key(frames)
         missing = [frame.label for frame, T in zip(frames, found, strict=True) if T is None]
         if missing:
             what = f"{len(missing)} of {len(frames)} frames have no pose in {self.file.path}, the first is {missing[0]}"
@@ -138,6 +138,21 @@ class FramePoses:
                 raise BadInputError("no_pose", f"{what}: {hint}{way_out}")
             self.lines.append(f"{what}: left out")
         return found
+
+    @property
+    def is_by_time(self) -> bool:
+        """True if a frame finds its pose by time."""
+        return self.file.key is KeyKind.TIME
+
+    def pose_near(self, time_s: float) -> Transform:
+        """The pose at a time, of poses by time; before the first and after the last pose that one.
+
+        Raises:
+            BadInputError: `no_pose`: the neighbours are too far apart.
+        """
+        first_s, last_s = float(self.rows[0].key), float(self.rows[-1].key)
+        max_gap_s = MAX_GAP_S if self.options.max_gap_s is None else self.options.max_gap_s
+        return self._trajectory().pose_at(min(max(time_s, first_s), last_s), max_gap_s=max_gap_s)
 
     def report(self) -> list[str]:
         """Sentences that state the form, the conventions, what was left out, and doubts."""
@@ -154,9 +169,15 @@ class FramePoses:
             )
         return said + self.lines
 
+    def _trajectory(self) -> Trajectory:
+        if self._by_times is None:
+            times_s = np.array([float(row.key) for row in self.rows])
+            self._by_times = Trajectory(self.file.path, TimedList(times_s, tuple(row.T for row in self.rows)))
+        return self._by_times
+
     def _by_time(self, frames: Sequence[FrameKey], max_gap_s: float) -> list[Transform | None]:
-        times_s = np.array([float(row.key) for row in self.rows])
-        trajectory = Trajectory(self.file.path, TimedList(times_s, tuple(row.T for row in self.rows)))
+        trajectory = self._trajectory()
+        times_s = trajectory.poses.times_s
         found: list[Transform | None] = []
         for frame in frames:
             if frame.time_s is None:

@@ -67,12 +67,21 @@ class ScanSource(Protocol):
         """Sentences about a pose file: its form and conventions, what was left out, and doubts."""
         ...
 
+    @property
+    def has_times(self) -> bool:
+        """False if the scans' times are made up: they tell the order alone."""
+        ...
+
     def __len__(self) -> int: ...
 
     def __iter__(self) -> Iterator[Scan]: ...
 
     def scan(self, index: int, /) -> Scan:
         """The scan of an index, 0 .. len - 1."""
+        ...
+
+    def place(self, index: int, /) -> tuple[float, Transform]:
+        """Time and `T_map_rig` of the scan of an index; its images are not read."""
         ...
 
     def measurements(self) -> Sequence[range]:
@@ -110,6 +119,7 @@ class Recording:
     """Poses that were not quite rotations."""
     pose_notes: Sequence[str] = ()
     """Sentences about a pose file."""
+    has_times: bool = True
 
     def __len__(self) -> int:
         return len(self.files)
@@ -120,6 +130,10 @@ class Recording:
     def measurements(self) -> Sequence[range]:
         """The scan indices of each measurement, in order; together all scans, each once."""
         return self.stops
+
+    def place(self, index: int, /) -> tuple[float, Transform]:
+        """Time and `T_map_rig` of the scan of an index; its images are not read."""
+        return self.files[index].time_s, self.files[index].T_map_rig
 
     def scan(self, index: int, /) -> Scan:
         """One scan, its images read from disk now.

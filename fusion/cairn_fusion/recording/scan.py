@@ -5,6 +5,7 @@
     colour       {camera: (H, W, 3) uint8}     sRGB, in R, G, B order
     thermal      {camera: (H, W) float32}      apparent temperature, kelvin; NaN = no reading
     scalars      {channel: float}              named readings at the rig's origin (dose, gas, ...)
+    points_m     (N, 3) float32   metres, of a sweep without a raster; then range_m is its image to look at
     T_map_body   pose of the robot's body, so that its own points can be left out
 
 Other conventions (z-depth, millimetres, raw counts) enter through `recording_format` only.
@@ -18,6 +19,7 @@ import numpy.typing as npt
 
 from cairn_calib.rig.poses import Transform, check_transform
 from cairn_calib.rig.rig import Rig, Spectrum
+from cairn_fusion.recording.scan_units import check_ranges, check_temperatures, check_time
 from cairn_map.errors import BadInputError
 
 Image = npt.NDArray[np.generic]
@@ -34,12 +36,21 @@ class Scan:
     range_camera: str
     """Camera of `range_m` and `amplitude`."""
     range_m: npt.NDArray[np.float32]
+    points_m: npt.NDArray[np.float32] | None = None
+    """Points that `range_camera` saw from its origin, in its frame; they, not `range_m`, become evidence."""
     amplitude: npt.NDArray[np.uint16] | None = None
     colour: Mapping[str, npt.NDArray[np.uint8]] = field(default_factory=dict)
     thermal: Mapping[str, npt.NDArray[np.float32]] = field(default_factory=dict)
     scalars: Mapping[str, float] = field(default_factory=dict)
     T_map_body: Transform | None = None
     """Pose of the frame of the rig's body; None: the body's boxes are in the rig's frame."""
+
+    def __repr__(self) -> str:
+        height, width = self.range_m.shape if self.range_m.ndim == 2 else (0, 0)
+        images = [f"{self.range_camera} {width} x {height}", *self.colour, *self.thermal]
+        points = "" if self.points_m is None else f", {len(self.points_m)} points"
+        place = ", ".join(f"{value:.3f}" for value in self.T_map_rig[:3, 3])
+        return f"Scan({self.time_s:.3f} s, at ({place}) m, {', '.join(images)}{points})"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "T_map_rig", check_transform(self.T_map_rig, name="T_map_rig"))
@@ -53,12 +64,20 @@ class Scan:
 
 
 def check_scan(scan: Scan, rig: Rig) -> None:
-    """Refuse a scan whose images do not fit the rig's cameras in size, type or spectrum.
+    """Refuse a scan whose images do not fit the rig's cameras in size, type or spectrum, or are in another unit.
 
     Raises:
-        BadInputError: with the camera's name and what was expected.
+        BadInputError: with the camera's name and what was expected; kind `bad_units`: `scan_units`.
     """
+    for kind, images in (("colour", scan.colour), ("thermal", scan.thermal)):
+        if not isinstance(images, Mapping):
+            raise BadInputError(
+                "bad_scan",
+                f"{kind} must be a mapping from cameras to images, {{camera: array}}; got {type(images).__name__}",
+            )
     _check_image(rig, scan.range_camera, scan.range_m, Spectrum.RANGE, np.float32)
+    if scan.points_m is not None:
+        _check_points(scan, scan.points_m)
     if scan.amplitude is not None:
         _check_image(rig, scan.range_camera, scan.amplitude, Spectrum.RANGE, np.uint16)
     for name, image in scan.colour.items():
@@ -67,6 +86,9 @@ def check_scan(scan: Scan, rig: Rig) -> None:
             raise BadInputError("bad_scan", f"colour image of {name} must be (H, W, 3), got {image.shape}")
     for name, kelvin in scan.thermal.items():
         _check_image(rig, name, kelvin, Spectrum.THERMAL, np.float32)
+        check_temperatures(name, kelvin)
+    check_ranges(scan.range_camera, scan.range_m)
+    check_time(scan.time_s)
 
 
 def _check_image(rig: Rig, name: str, image: Image, spectrum: Spectrum, dtype: type[np.generic]) -> None:
@@ -76,3 +98,10 @@ def _check_image(rig: Rig, name: str, image: Image, spectrum: Spectrum, dtype: t
     if image.dtype != dtype:
         raise BadInputError("bad_scan", f"{spectrum} image of {name} must be {np.dtype(dtype)}, got {image.dtype}")
     mounted.camera.check_image(image, name=f"{spectrum} image of {name}")
+
+
+def _check_points(scan: Scan, points: Image) -> None:
+    if points.ndim != 2 or points.shape[1] != 3 or points.dtype != np.float32:
+        raise BadInputError("bad_scan", f"points_m must be (N, 3) float32, got {points.dtype} of shape {points.shape}")
+    if scan.amplitude is not None or scan.colour or scan.thermal:
+        raise BadInputError("bad_scan", "points without a raster carry no amplitude, colour or temperature")

@@ -9,13 +9,13 @@ import json
 import math
 import struct
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
 import zstandard
 
-from cairn_calib.rig.poses import Transform, inverse
+from cairn_calib.rig.poses import Transform, check_transform, inverse
 from cairn_fusion.recording.scan import Scan
 from cairn_map.errors import DamagedDataError
 
@@ -63,6 +63,7 @@ def decode_scan(data: bytes) -> Scan:
             T_map_rig=arrays["pose", "rig"],
             range_camera=head["range_camera"],
             range_m=arrays["range", ""],
+            points_m=arrays.get(("points", "")),
             amplitude=arrays.get(("amplitude", "")),
             colour=_of_kind(arrays, "colour"),
             thermal=_of_kind(arrays, "thermal"),
@@ -74,29 +75,52 @@ def decode_scan(data: bytes) -> Scan:
     return _with_poses(scan, arrays["pose", "rig"], arrays.get(("pose", "body")))
 
 
+def read_images(file: BinaryIO) -> frozenset[tuple[str, str, str, tuple[int, ...]]]:
+    """Kind, camera, type and shape of each array of the scan that begins at the file's place; images are not read.
+
+    Points without a raster have shape (), however many there are.
+
+    Raises:
+        DamagedDataError: no scan begins there.
+    """
+    try:
+        (length,) = HEAD.unpack(file.read(HEAD.size))
+        arrays = json.loads(file.read(length))["arrays"]
+        return frozenset(
+            (str(kind), str(name), str(dtype), () if kind == "points" else tuple(shape))
+            for kind, name, dtype, shape in arrays
+        )
+    except (struct.error, ValueError, KeyError, TypeError) as exc:
+        raise DamagedDataError("damaged_scan", f"a kept scan is damaged: {exc}") from exc
+
+
 def move_scan(scan: Scan, T_map_rig: Transform) -> Scan:
     """Give a scan another pose; the robot's body moves with the rig.
 
     Raises:
         BadInputError: the pose is none.
     """
+    return place_scan(scan, check_transform(T_map_rig, name="T_map_rig"))
+
+
+def place_scan(scan: Scan, T_map_rig: Transform) -> Scan:
+    """Give a scan the pose of one that was checked, bit for bit; the robot's body moves with the rig."""
     T_map_body = scan.T_map_body
     moved = Scan(
         time_s=scan.time_s,
         T_map_rig=T_map_rig,
         range_camera=scan.range_camera,
         range_m=scan.range_m,
+        points_m=scan.points_m,
         amplitude=scan.amplitude,
         colour=scan.colour,
         thermal=scan.thermal,
         scalars=scan.scalars,
     )
-    if T_map_body is None:
-        return moved
     # For an unchanged pose not even the last bit of the body's pose changes.
-    same_pose = np.array_equal(moved.T_map_rig, scan.T_map_rig)
-    there = T_map_body if same_pose else moved.T_map_rig @ inverse(scan.T_map_rig) @ T_map_body
-    return _with_poses(moved, moved.T_map_rig, there)
+    same_pose = np.array_equal(T_map_rig, scan.T_map_rig)
+    there = T_map_body if same_pose or T_map_body is None else T_map_rig @ inverse(scan.T_map_rig) @ T_map_body
+    return _with_poses(moved, T_map_rig, there)
 
 
 def _arrays(scan: Scan) -> dict[tuple[str, str], Array]:
@@ -104,6 +128,8 @@ def _arrays(scan: Scan) -> dict[tuple[str, str], Array]:
     arrays: dict[tuple[str, str], Array] = {("pose", "rig"): scan.T_map_rig, ("range", ""): scan.range_m}
     if scan.T_map_body is not None:
         arrays["pose", "body"] = scan.T_map_body
+    if scan.points_m is not None:
+        arrays["points", ""] = scan.points_m
     if scan.amplitude is not None:
         arrays["amplitude", ""] = scan.amplitude
     arrays |= {("colour", name): image for name, image in scan.colour.items()}

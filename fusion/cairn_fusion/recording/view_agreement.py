@@ -105,6 +105,10 @@ def _agreement(
     x, y = np.rint(pixels[is_inside]).astype(int).T
     height, width = second.range_m.shape
     measured_m = second.range_m[np.clip(y, 0, height - 1), x % width]
+    if second.points_m is not None:
+        # Most pixels of a raster that is not the sensor's own are empty, which says nothing.
+        is_seen = np.isfinite(measured_m)
+        there, measured_m = there[is_seen], measured_m[is_seen]
     distance_m = np.linalg.norm(there, axis=-1)
     with np.errstate(invalid="ignore"):
         agree = np.abs(measured_m - distance_m) <= RANGE_TOLERANCE * distance_m

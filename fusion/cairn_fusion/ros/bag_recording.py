@@ -15,7 +15,11 @@ import numpy.typing as npt
 
 from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.lidar import AnyCamera, SpinningLidar
+from cairn_calib.rig.poses import Transform, inverse
 from cairn_calib.rig.rig import Rig, Spectrum, mount_camera
+from cairn_fusion.clouds.cloud_columns import cloud_of
+from cairn_fusion.clouds.deskew import deskewed, point_times
+from cairn_fusion.clouds.sweep_image import R_LIDAR_CAMERA, T_LIDAR_CAMERA, sweep_image
 from cairn_fusion.recording.frame_poses import PoseOptions, read_frame_poses
 from cairn_fusion.recording.recording import measurements_of
 from cairn_fusion.recording.recording_format import (
@@ -32,8 +36,8 @@ from cairn_fusion.ros.bag_scans import BagScan, scans_of
 from cairn_fusion.ros.images import AnyImage, Pixels, amplitude_of, colour_of, depth_of, thermal_counts_of
 from cairn_fusion.ros.messages import COMPRESSED, IMAGE, POINTS, TRANSFORMS, read_compressed_image, read_image
 from cairn_fusion.ros.open_bag import open_bag
-from cairn_fusion.ros.point_clouds import T_LIDAR_CAMERA, check_beams, read_points, sweep_image
-from cairn_fusion.ros.topic_mapping import BagMapping, MappedCamera, camera_of_info, mapping_from_yaml
+from cairn_fusion.ros.point_clouds import check_beams, read_points
+from cairn_fusion.ros.topic_mapping import BagMapping, LidarKind, MappedCamera, camera_of_info, mapping_from_yaml
 from cairn_fusion.ros.topic_proposal import Proposal, propose
 from cairn_map.errors import BadInputError, DamagedDataError, NotFoundError
 
@@ -80,6 +84,7 @@ class BagRecording:
         *,
         scans_per_measurement: int | None = None,
         poses: PoseOptions | None = None,
+        is_deskewed: bool = False,
     ) -> None:
         """Find all scans in an index that holds the mapping's topics.
 
@@ -95,12 +100,18 @@ class BagRecording:
         self.name = mapping.name
         self.rig = _rig_of(index, mapping, self._topics)
         found = None if poses is None else read_frame_poses(poses, self.rig)
-        self._scans = scans_of(bag, index, mapping, self._topics, found)
+        self._scans, self._pose_at = scans_of(bag, index, mapping, self._topics, found)
+        self._is_deskewed = is_deskewed
         self.rounding = index.tree.rounding if found is None else found.rounding
         self.pose_notes: Sequence[str] = () if found is None else found.report()
         size = mapping.scans_per_measurement if scans_per_measurement is None else scans_per_measurement
         self._stops = measurements_of(len(self._scans), size)
         finalize(self, bag.close)
+
+    @property
+    def has_times(self) -> bool:
+        """True: messages have times."""
+        return True
 
     def __len__(self) -> int:
         return len(self._scans)
@@ -111,6 +122,10 @@ class BagRecording:
     def measurements(self) -> Sequence[range]:
         """The scan indices of each measurement, in order; together all scans, each once."""
         return self._stops
+
+    def place(self, index: int, /) -> tuple[float, Transform]:
+        """Time and `T_map_rig` of the scan of an index; its images are not read."""
+        return self._scans[index].time_s, self._scans[index].T_map_rig
 
     def scan(self, index: int, /) -> Scan:
         """One scan, its images read from the bag now.
@@ -126,11 +141,13 @@ class BagRecording:
         found = self._scans[index]
         cameras = self._mapping.cameras
         own = cameras[found.camera]
+        xyz = None if own.lidar is None else self._sweep(own, found)
         scan = Scan(
             time_s=found.time_s,
             T_map_rig=found.T_map_rig,
             range_camera=found.camera,
-            range_m=self._sweep(own, found) if own.lidar else self._range(own, found),
+            range_m=self._range(own, found) if xyz is None else sweep_image(xyz, self._lidar(found.camera)),
+            points_m=None if xyz is None or not _is_loose(own) else (xyz @ R_LIDAR_CAMERA).astype(np.float32),
             amplitude=self._amplitude(own, found),
             colour={
                 name: self._pixels(camera.topic, found, colour_of)
@@ -150,15 +167,31 @@ class BagRecording:
         """(H, W) metres along the beam."""
         return _range_of(self._pixels(camera.topic, found, depth_of), self.rig[found.camera].camera, camera)
 
-    def _sweep(self, camera: MappedCamera, found: BagScan) -> npt.NDArray[np.float32]:
-        """(H, W) metres along the beam, of a lidar's cloud."""
-        lidar = self.rig[found.camera].camera
+    def _sweep(self, camera: MappedCamera, found: BagScan) -> npt.NDArray[np.float64]:
+        """(N, 3) the points of a lidar's cloud, metres, its own frame; of a known lidar they must lie on its beams."""
         message = self._readers[camera.topic].message(found.images[camera.topic])
         with translate_message_damage(self._bag, message):
-            xyz = read_points(message.data, wire_of(self._topics[camera.topic].topic)).xyz()
+            points = read_points(message.data, wire_of(self._topics[camera.topic].topic))
+            xyz = points.xyz()
+        if not _is_loose(camera):
+            check_beams(xyz, self._lidar(found.camera), found.camera)
+            return xyz
+        place = f"{self._bag.path.name}: {camera.topic} at {found.time_s:.6f} s"
+        cloud = cloud_of({name: points.column(name) for name in points.fields}, place)
+        times = None if self._is_deskewed or self._pose_at is None else point_times(cloud, place)
+        if times is None or self._pose_at is None:
+            return cloud.points.astype(np.float64)
+        # The way of the lidar, which is fixed on the base.
+        T_base_lidar, way = self.rig[found.camera].transform @ inverse(T_LIDAR_CAMERA), self._pose_at
+        moved = deskewed(
+            cloud.points, times.absolute_s(found.time_s, place), found.time_s, lambda time_s: way(time_s) @ T_base_lidar
+        )
+        return moved.astype(np.float64)
+
+    def _lidar(self, name: str) -> SpinningLidar:
+        lidar = self.rig[name].camera
         assert isinstance(lidar, SpinningLidar)  # noqa: S101 - `_camera_of` made it so
-        check_beams(xyz, lidar, found.camera)
-        return sweep_image(xyz, lidar)
+        return lidar
 
     def _amplitude(self, camera: MappedCamera, found: BagScan) -> npt.NDArray[np.uint16] | None:
         has_one = camera.amplitude is not None and camera.amplitude in found.images
@@ -181,6 +214,7 @@ def open_bag_recording(
     *,
     scans_per_measurement: int | None = None,
     poses: PoseOptions | None = None,
+    is_deskewed: bool = False,
 ) -> BagRecording:
     """Scans of a bag, indexed in one pass, its images not yet decoded.
 
@@ -200,10 +234,17 @@ def open_bag_recording(
             )
         transforms = {name for name, topic in bag.topics.items() if topic.type in TRANSFORMS}
         index = index_bag(bag, wanted | transforms)
-        return BagRecording(bag, index, mapping, scans_per_measurement=scans_per_measurement, poses=poses)
+        return BagRecording(
+            bag, index, mapping, scans_per_measurement=scans_per_measurement, poses=poses, is_deskewed=is_deskewed
+        )
     except BaseException:
         bag.close()
         raise
+
+
+def _is_loose(camera: MappedCamera) -> bool:
+    """True if a topic's points have no raster."""
+    return camera.lidar is not None and camera.lidar.kind is LidarKind.CLOUD
 
 
 def _image_topics(mapping: BagMapping) -> Iterator[tuple[str, str, tuple[str, ...]]]:
@@ -293,6 +334,7 @@ def open_any_bag(
     *,
     scans_per_measurement: int | None = None,
     poses: PoseOptions | None = None,
+    is_deskewed: bool = False,
 ) -> BagRecording:
     """Scans of a bag by a mapping, or by the proposed one if it leaves no question open.
 
@@ -310,4 +352,6 @@ def open_any_bag(
                 "bag.yaml`, edit it, and give it with --topics bag.yaml",
             )
         mapping = mapping_from_yaml(proposal.text, f"the topics proposed for {path}")
-    return open_bag_recording(path, mapping, scans_per_measurement=scans_per_measurement, poses=poses)
+    return open_bag_recording(
+        path, mapping, scans_per_measurement=scans_per_measurement, poses=poses, is_deskewed=is_deskewed
+    )

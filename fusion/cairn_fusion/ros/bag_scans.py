@@ -23,6 +23,10 @@ from cairn_map.errors import BadInputError
 log = logging.getLogger(__name__)
 
 
+PoseAt = Callable[[float], Transform]
+"""`T_map_base` by time; before the first and after the last pose that one."""
+
+
 @dataclass(frozen=True, slots=True)
 class BagScan:
     """One scan: numbers of its images' messages in their topics."""
@@ -40,8 +44,10 @@ def scans_of(
     mapping: BagMapping,
     topics: Mapping[str, TopicIndex],
     poses: FramePoses | None = None,
-) -> tuple[BagScan, ...]:
-    """A scan for each range image between the first and the last pose, in order of time.
+) -> tuple[tuple[BagScan, ...], PoseAt | None]:
+    """A scan for each range image between the first and the last pose, in order of time; and the way between them.
+
+    The way is None for poses that are not by time.
 
     Args:
         bag: named in messages.
@@ -55,7 +61,7 @@ def scans_of(
     """
     lists = {name: _by_time(entry) for name, entry in topics.items()}
     if poses is not None:
-        return _scans_with_poses(bag, mapping, lists, poses)
+        return _scans_with_poses(bag, mapping, lists, poses), poses.pose_near if poses.is_by_time else None
     pose_at, first_s, last_s = _poses_of(index, mapping)
     scans: list[BagScan] = []
     for name, camera in mapping.cameras.items():
@@ -80,7 +86,8 @@ def scans_of(
             f"{bag.path} has no range image between its first pose ({first_s:.3f} s) and its last ({last_s:.3f} s) of "
             f"{mapping.frames.base} in {mapping.frames.map}; see `cairn robot inspect` for its topics and times",
         )
-    return tuple(sorted(scans, key=lambda scan: scan.time_s))
+    in_order = tuple(sorted(scans, key=lambda scan: scan.time_s))
+    return in_order, lambda time_s: pose_at(min(max(time_s, first_s), last_s))
 
 
 def _scans_with_poses(

@@ -1,8 +1,7 @@
-"""Point clouds of spinning lidars (`sensor_msgs/PointCloud2`) as range images of a `SpinningLidar`.
+"""Point clouds of lidars (`sensor_msgs/PointCloud2`): their points, and the beams that measured them.
 
-A cloud has no raster: each point goes into the pixel whose ray is nearest to it, and of several the nearest counts. So
-a direction is exact to half a column and half the step between two beams; the range is the point's own. The rig's
-motion during one turn is left to the driver that published the cloud.
+Points of known beams are taken to be moved to one time by the driver that published the cloud; those without rings are
+moved by their own times, where they have some (`clouds.deskew`).
 """
 
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ import numpy.typing as npt
 
 from cairn_calib.rig.lidar import SpinningLidar
 from cairn_calib.rig.raster import MAX_SIDE_PX
+from cairn_fusion.clouds.sweep_image import R_LIDAR_CAMERA
 from cairn_fusion.ros.bag import Wire
 from cairn_fusion.ros.messages import RosHeader, WireReader, header_of
 from cairn_map.errors import BadInputError
@@ -31,9 +31,6 @@ PIXEL_SHARE_MIN = 0.4
 """Least share of points that have a pixel of their own; clouds with two returns a beam have 0.5."""
 CHECKED_POINTS_MIN = 100
 """Points of the smallest cloud of which shares say something."""
-R_LIDAR_CAMERA = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-"""Rotation from a camera's axes (x right, y down, z forward) to a lidar's in ROS (x forward, y left, z up; REP 103)."""
-T_LIDAR_CAMERA = np.block([[R_LIDAR_CAMERA, np.zeros((3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]])
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,24 +116,6 @@ def elevations_of(points: RosPoints) -> tuple[float, ...] | None:
     return tuple(round(float(value), 3) for value in medians_deg)
 
 
-def sweep_image(xyz: npt.NDArray[np.float64], lidar: SpinningLidar) -> npt.NDArray[np.float32]:
-    """(H, W) float32, metres along the beam; NaN where no point is.
-
-    Args:
-        xyz: (N, 3) metres, x forward, y left, z up; NaN where nothing came back.
-        lidar: the raster.
-    """
-    own = xyz[np.isfinite(xyz).all(axis=1)] @ R_LIDAR_CAMERA
-    range_m = np.linalg.norm(own, axis=1)
-    pixels = lidar.project(own)
-    kept = np.isfinite(pixels).all(axis=1) & (range_m > 0)
-    x = np.rint(pixels[kept, 0]).astype(np.int64) % lidar.width
-    y = np.clip(np.rint(pixels[kept, 1]).astype(np.int64), 0, lidar.height - 1)
-    nearest = np.full((lidar.height, lidar.width), np.inf)
-    np.minimum.at(nearest, (y, x), range_m[kept])
-    return np.where(np.isfinite(nearest), nearest, np.nan).astype(np.float32)
-
-
 def check_beams(xyz: npt.NDArray[np.float64], lidar: SpinningLidar, name: str) -> None:
     """Refuse a cloud whose points another lidar must have measured: a wrong model maps them where nothing was.
 
@@ -165,7 +144,8 @@ def check_beams(xyz: npt.NDArray[np.float64], lidar: SpinningLidar, name: str) -
             f"camera {name}: elevations_deg does not describe its lidar: only {share:.0%} of a cloud's {len(own)} "
             f"points lie within {FIT_DEG:g} degrees, or {FIT_STEPS:g} of a step, of one of the {lidar.height} beams "
             f"({np.median(off_deg):.2g} degrees off in the median, {off_deg.max():.2g} at most; the points' elevations "
-            f"are {elevations_deg.min():.1f} to {elevations_deg.max():.1f}). Take the beams of its data sheet",
+            f"are {elevations_deg.min():.1f} to {elevations_deg.max():.1f}). Take the beams of its data sheet, or "
+            "lidar: {kind: cloud}",
         )
     pixels = lidar.project(own[fits])
     pixels = pixels[np.isfinite(pixels).all(axis=1)]

@@ -10,6 +10,7 @@ cameras:
   colour: {spectrum: colour, topic: /camera/color/image_raw, info: /camera/color/camera_info}
 """
 
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Self
 
@@ -22,6 +23,7 @@ from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.lidar import SpinningLidar
 from cairn_calib.rig.raster import Side
 from cairn_calib.rig.rig import Row, Spectrum
+from cairn_fusion.clouds.sweep_image import virtual_lidar
 from cairn_fusion.recording.recording_format import (
     Convention,
     Name,
@@ -79,21 +81,36 @@ class Intrinsics(Model):
     """k1, k2, p1, p2, k3: ROS's plumb_bob."""
 
 
-class MappedLidar(Model):
-    """The raster that a spinning lidar's points are sorted into; its frame is ROS's: x forward, y left, z up."""
+class LidarKind(StrEnum):
+    """Kind of a topic of points."""
 
-    columns: Side
-    """Columns of one turn."""
-    elevations_deg: Annotated[tuple[Finite, ...], Field(min_length=1, max_length=1024)]
-    """Elevation of each beam, degrees, the highest first."""
+    SPINNING = "spinning"
+    """Its beams are known: points are sorted into its raster."""
+    CLOUD = "cloud"
+    """Points without rows and rings: each is a beam of its own."""
+
+
+class MappedLidar(Model):
+    """A lidar; its frame is ROS's: x forward, y left, z up."""
+
+    kind: LidarKind = LidarKind.SPINNING
+    columns: Side | None = None
+    """Columns of one turn; of a spinning lidar only."""
+    elevations_deg: Annotated[tuple[Finite, ...], Field(min_length=1, max_length=1024)] | None = None
+    """Elevation of each beam, degrees, the highest first; of a spinning lidar only."""
 
     @model_validator(mode="after")
     def _is_lidar(self) -> Self:
+        given = {self.columns is None, self.elevations_deg is None}
+        if given != {self.kind is LidarKind.CLOUD}:
+            raise ValueError("a spinning lidar has columns and elevations_deg, one of kind cloud has neither")
         self.lidar()
         return self
 
     def lidar(self) -> SpinningLidar:
         """The lidar as a camera model."""
+        if self.columns is None or self.elevations_deg is None:
+            return virtual_lidar()
         beams = self.elevations_deg
         return SpinningLidar(width=self.columns, height=len(beams), elevations_deg=beams)
 

@@ -35,6 +35,31 @@ GAPS = 3
 """Usual gaps between poses that the proposed `max_gap_s` spans."""
 
 
+PACKETS = {
+    **dict.fromkeys(
+        ("ouster_ros/PacketMsg", "ouster_msgs/PacketMsg", "ouster_sensor_msgs/PacketMsg"),
+        ("an Ouster", "`ros2 launch ouster_ros replay.launch.xml`"),
+    ),
+    **dict.fromkeys(
+        ("velodyne_msgs/VelodyneScan", "velodyne_msgs/VelodynePacket"),
+        ("a Velodyne", "the node `velodyne_transform_node` of velodyne_pointcloud"),
+    ),
+    **dict.fromkeys(
+        ("livox_ros_driver/CustomMsg", "livox_ros_driver2/CustomMsg", "livox_interfaces/CustomMsg"),
+        ("a Livox", "its driver with xfer_format 0 (PointCloud2)"),
+    ),
+    **dict.fromkeys(
+        ("rslidar_msg/RslidarPacket", "rslidar_msgs/rslidarScan", "rslidar_msgs/rslidarPacket"),
+        ("a RoboSense", "the node of rslidar_sdk with msg_source 2"),
+    ),
+    **dict.fromkeys(
+        ("pandar_msgs/PandarScan", "hesai_ros_driver/UdpFrame"),
+        ("a Hesai", "the node of its driver that publishes points"),
+    ),
+}
+"""Makers of lidars, and the program that makes points of their packets, by the packets' type."""
+
+
 @dataclass(frozen=True, slots=True)
 class Proposal:
     """Proposed mapping, as text to edit."""
@@ -71,6 +96,7 @@ def propose(index: BagIndex, path: Path) -> Proposal:
     questions: list[str] = []
     cameras = _cameras(index, questions)
     ranges = [camera for camera in cameras if camera.spectrum is Spectrum.RANGE]
+    questions += _packet_questions(index)
     if not ranges:
         questions.append("no topic looks like depth images; name one under cameras, with `spectrum: range`")
     # Stage 2: poses of the first range camera's frame, and times by its rate.
@@ -91,6 +117,18 @@ def propose(index: BagIndex, path: Path) -> Proposal:
     for camera in cameras:
         lines += _camera_lines(camera, index)
     return Proposal("\n".join(lines) + "\n", tuple(questions))
+
+
+def _packet_questions(index: BagIndex) -> list[str]:
+    """Questions about topics of packets that a lidar's driver has not yet made points of."""
+    packets = [
+        (entry.topic.name, PACKETS[entry.topic.type]) for entry in index.topics.values() if entry.topic.type in PACKETS
+    ]
+    return [
+        f"{name} holds raw packets of {maker}, no points: play the bag through {program}, record its PointCloud2, "
+        "and take that bag"
+        for name, (maker, program) in packets
+    ]
 
 
 def _cameras(index: BagIndex, questions: list[str]) -> list[Guess]:
@@ -114,7 +152,7 @@ def _cameras(index: BagIndex, questions: list[str]) -> list[Guess]:
                 questions.append(f"camera {name}: no CameraInfo next to {entry.topic.name}; write its intrinsics")
     # Depth cameras first, so that the first range camera is one of them if there is any.
     ranges = [guess for guess in guesses if guess.spectrum is Spectrum.RANGE]
-    guesses += _lidars(index, questions)
+    guesses += _lidars(index)
     if len(ranges) > 1:
         names = ", ".join(guess.entry.topic.name for guess in ranges)
         questions.append(f"{names} may be one sensor seen twice (aligned to another camera): keep one of such")
@@ -126,13 +164,10 @@ def _cameras(index: BagIndex, questions: list[str]) -> list[Guess]:
     return guesses
 
 
-def _lidars(index: BagIndex, questions: list[str]) -> list[Guess]:
+def _lidars(index: BagIndex) -> list[Guess]:
     """Guesses for topics of point clouds that a lidar may have made."""
     clouds = [e for e in index.topics.values() if e.topic.type == POINTS and len(e) and e.topic.wire is not None]
     found = [e for e in clouds if not CAMERA_WORDS.search(_word(e))]
-    for n, entry in enumerate(found):
-        if entry.elevations_deg is None:
-            questions.append(f"lidar{n or ''}: which beams {entry.topic.name} has; neither rows nor rings tell them")
     return [Guess(f"lidar{n or ''}", Spectrum.RANGE, entry, None) for n, entry in enumerate(found)]
 
 
@@ -226,10 +261,12 @@ def _camera_lines(camera: Guess, index: BagIndex) -> Iterator[str]:
     yield f"    topic: {_quoted(camera.entry.topic.name)}  # {camera.entry.encoding}, {camera.entry.rate_hz:.3g} Hz"
     if camera.entry.topic.type == POINTS:
         known = camera.entry.elevations_deg
-        beams = list(known) if known is not None else f"{DECIDE}  # of each beam, the highest first, such as [15, 13]"
-        yield "    lidar:"
-        yield f"      columns: {min(camera.entry.columns, 4096)}"
-        yield f"      elevations_deg: {beams}"
+        if known is None:
+            yield "    lidar: {kind: cloud}  # neither rows nor rings tell its beams: each point is a beam of its own"
+        else:
+            yield "    lidar:"
+            yield f"      columns: {min(camera.entry.columns, 4096)}"
+            yield f"      elevations_deg: {list(known)}"
         yield f"    frame: {_quoted(camera.entry.frame)}  # x forward, y left, z up"
         return
     if camera.info:

@@ -10,7 +10,7 @@ import hashlib
 import json
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated, Literal, Self
 
 import numpy as np
@@ -110,14 +110,17 @@ class CommitMeta(BaseModel):
         return tuple(commit_id_from_text(text) for text in self.retracts)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Commit:
     """A whole commit: its meta, its cells' bytes, its SHA-256 (32 bytes), and all its bytes."""
 
-    meta: CommitMeta = field(repr=False)
-    cells: Mapping[CellKey, bytes] = field(repr=False)
-    sha: bytes = field(repr=False)
-    data: bytes = field(repr=False)
+    meta: CommitMeta
+    cells: Mapping[CellKey, bytes]
+    sha: bytes
+    data: bytes
+
+    def __repr__(self) -> str:
+        return f"Commit({self.id}, {len(self.cells)} cells, {len(self.data)} bytes)"
 
     def __str__(self) -> str:
         return f"commit {self.id}: {len(self.cells)} cells, {len(self.data)} bytes"

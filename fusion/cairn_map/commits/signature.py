@@ -22,6 +22,19 @@ from cairn_map.errors import BadInputError
 KEY_BYTES, MARK_BYTES = 32, 64
 SIGNATURES_MAX = 16
 """Signatures of one commit: its author's, and those of the robot's older incarnations whose commits it retracts."""
+SMALL_ORDER = frozenset(
+    bytes.fromhex(text)
+    for text in (
+        "00" * 32,
+        "01" + "00" * 31,
+        "26e8958fc2b227b045c3f489f2ef98f0d5dfac05d3c63339b13802886d53fc05",
+        "c7176a703d4dd84fba3c0b760d10670f2a2053fa2c39ccc64ec7fd7792ac037a",
+        "ec" + "ff" * 30 + "7f",
+        "ed" + "ff" * 30 + "7f",
+        "ee" + "ff" * 30 + "7f",
+    )
+)
+"""Encodings, without the sign, of points whose order divides eight: keys for which anyone can make a signature."""
 TEXT_MAX = SIGNATURES_MAX * (2 * (KEY_BYTES + MARK_BYTES) + 2)
 
 
@@ -101,6 +114,8 @@ def are_valid(signatures: Collection[Signature], message: bytes) -> bool:
     """True if all signatures are ones of a message."""
     try:
         for signature in signatures:
+            if signature.key[:-1] + bytes([signature.key[-1] & 0x7F]) in SMALL_ORDER:
+                return False
             Ed25519PublicKey.from_public_bytes(signature.key).verify(signature.mark, message)
     except (InvalidSignature, ValueError):
         return False

@@ -53,6 +53,13 @@ class VersionVector:
             merged[author] = _normal([*merged.get(author, ()), *spans])
         return VersionVector(merged)
 
+    def union(self, other: "VersionVector") -> "VersionVector":
+        """Commits of this set or the other."""
+        merged = dict(self.intervals)
+        for author, spans in other.intervals.items():
+            merged[author] = _normal([*merged.get(author, ()), *spans])
+        return VersionVector(merged)
+
     def minus(self, other: "VersionVector") -> "VersionVector":
         """Commits of this set that the other does not hold."""
         left: dict[Author, Intervals] = {}

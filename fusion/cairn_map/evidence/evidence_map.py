@@ -7,9 +7,12 @@ A map that is given a `coding` holds no cell in more than `HELD_PER_BYTE` times 
 it keeps the cell's bytes, and decodes them where they are read or changed, one cell at a time.
 """
 
+import hashlib
 from collections.abc import Callable, Iterator, Mapping
 from types import MappingProxyType
 from typing import NamedTuple
+
+import numpy as np
 
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.brick_cell import BrickCell
@@ -48,8 +51,34 @@ class EvidenceMap:
     def __len__(self) -> int:
         return len(self._cells)
 
+    def __repr__(self) -> str:
+        return f"EvidenceMap({len(self)} cells, {self._size_bytes} bytes, {self.geometry})"
+
     def __contains__(self, key: CellKey) -> bool:
         return key in self._cells
+
+    def __eq__(self, other: object) -> bool:
+        """True for the same evidence in the same grid, however it came together."""
+        if not isinstance(other, EvidenceMap):
+            return NotImplemented
+        return self.geometry == other.geometry and self.digest() == other.digest()
+
+    __hash__ = None  # type: ignore[assignment]  # it changes
+
+    def digest(self) -> str:
+        """SHA-256, in hex, of all evidence: equal maps have equal digests, on any machine.
+
+        It is over the geometry's digest, and for each cell that holds evidence, rising in number, over its number and
+        its packed arrays (`Evidence`): their lengths and numbers as little-endian int64.
+        """
+        found = hashlib.sha256(self.geometry.digest())
+        for key in sorted(self._cells):
+            evidence = self._cells[key].cell.packed()
+            if len(evidence):
+                found.update(np.array([key, len(evidence), len(evidence.sampled)], "<i8").tobytes())
+                for array in (evidence.voxels, evidence.counts, evidence.sampled, evidence.samples):
+                    found.update(np.ascontiguousarray(array, "<i8").data)
+        return found.hexdigest()
 
     def merge(self, diff: Diff, *, bodies: Bodies = NO_BODIES) -> None:
         """Add a diff.

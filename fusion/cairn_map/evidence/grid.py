@@ -33,6 +33,9 @@ CELL_LIMIT = 1 << 20
 BRICK_DEPTH = 3
 """A brick is 8^3 voxels, the three lowest octree depths."""
 DEPTH_MAX = 8
+STANDARD_EDGE_UM, STANDARD_CELL_UM, STANDARD_DEPTH_MAX, STANDARD_SUMS_MAX = 40_000, 5_120_000, 7, 9 << 21
+"""Standard voxels' edge; and bounds of standard cells: their edge, their depth, and the sums of samples that a full one
+has, which are those of 128^3 voxels with the standard channels."""
 CELL_TEXT = re.compile(",".join([r"(0|-?[1-9][0-9]{0,6})"] * 3))
 """The only text of each cell: `int` alone would also take " 1", "+1", "1_0" and other scripts' digits."""
 NANOMETRES = 1e9
@@ -53,11 +56,18 @@ class Cell(NamedTuple):
 class Geometry(BaseModel, frozen=True, extra="forbid"):
     """Geometry of a map, fixed at its creation: voxel edge, octree depth of a cell, channels."""
 
-    voxel_edge_um: Annotated[int, Field(ge=1000, le=1_000_000)] = 40_000
+    voxel_edge_um: Annotated[int, Field(ge=1000, le=1_000_000)] = STANDARD_EDGE_UM
     """Edge of a voxel, micrometres: an integer, so that borders are exact."""
-    depth: Annotated[int, Field(ge=BRICK_DEPTH, le=DEPTH_MAX)] = 7
-    """Octree depth of a cell, which has 2^depth voxels along an edge."""
+    depth: Annotated[int, Field(ge=BRICK_DEPTH, le=DEPTH_MAX)] = STANDARD_DEPTH_MAX
+    """Octree depth of a cell, which has 2^depth voxels along an edge. Standard are the largest cells of at most 5.12 m,
+    the paper's, and 128^3 voxels; of 64^3 or fewer if the samples have more than 9 planes."""
     channels: Annotated[tuple[Channel, ...], Field(max_length=16), FailFast()] = STANDARD_CHANNELS
+
+    @model_validator(mode="after")
+    def _with_depth(self) -> Self:
+        if "depth" not in self.model_fields_set:
+            object.__setattr__(self, "depth", _standard_depth(self.voxel_edge_um, self.plane_count))
+        return self
 
     @model_validator(mode="after")
     def _names_differ(self) -> Self:
@@ -65,6 +75,11 @@ class Geometry(BaseModel, frozen=True, extra="forbid"):
         if len(set(names)) != len(names) or "occupancy" in names:
             raise ValueError(f"channel names must differ from each other and from 'occupancy', got {names}")
         return self
+
+    def __str__(self) -> str:
+        """Such as `voxels of 0.04 m, cells of 128^3, channels colour, temperature`."""
+        names = ", ".join(channel.name for channel in self.channels) or "none"
+        return f"voxels of {self.voxel_edge_m:g} m, cells of {self.side}^3, channels {names}"
 
     @property
     def voxel_edge_m(self) -> float:
@@ -117,7 +132,9 @@ def _digest(voxel_edge_um: int, depth: int, channels: tuple[Channel, ...]) -> by
 
 
 def geometry_for(*, voxel_edge_m: float, channels: tuple[Channel, ...] = STANDARD_CHANNELS) -> Geometry:
-    """The geometry with the paper's cell edge of 5.12 m where the voxel edge allows it, else the nearest smaller power.
+    """The geometry with voxels of an edge in metres, and standard cells: as `Geometry(voxel_edge_um=...)`.
+
+    So a server can change a full cell in 850 MB of memory (docs/decisions/024-cells-of-at-most-128.md).
 
     Raises:
         BadInputError: the voxel edge is not 1 mm to 1 m.
@@ -125,10 +142,14 @@ def geometry_for(*, voxel_edge_m: float, channels: tuple[Channel, ...] = STANDAR
     edge_um = round(voxel_edge_m * 1e6)
     if not 1000 <= edge_um <= 1_000_000:
         raise BadInputError("bad_geometry", f"voxel edge must be 0.001 to 1 m, got {voxel_edge_m}")
-    depth = DEPTH_MAX
-    while depth > BRICK_DEPTH and (edge_um << depth) > 5_120_000:
+    return Geometry(voxel_edge_um=edge_um, channels=channels)
+
+
+def _standard_depth(edge_um: int, planes: int) -> int:
+    depth = STANDARD_DEPTH_MAX
+    while depth > BRICK_DEPTH and (edge_um << depth > STANDARD_CELL_UM or planes << 3 * depth > STANDARD_SUMS_MAX):
         depth -= 1
-    return Geometry(voxel_edge_um=edge_um, depth=depth, channels=channels)
+    return depth
 
 
 @lru_cache(maxsize=4096)

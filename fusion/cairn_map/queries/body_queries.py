@@ -39,11 +39,28 @@ class PathStates:
 
     states: npt.NDArray[np.uint8]
     """(N,) `State`: OCCUPIED if it meets an occupied voxel, else UNKNOWN if it meets an unknown one, else FREE."""
+    centres_m: Floats
+    """(N, 3) centre of the body at each pose, metres, map frame."""
+
+    def __repr__(self) -> str:
+        free = int((self.states == State.FREE).sum())
+        place = None if self.first_occupied is None else self.centres_m[self.first_occupied].round(3).tolist()
+        return f"PathStates({len(self.states)} poses, {free} free, first collision at {place} m)"
 
     @property
     def first_occupied(self) -> int | None:
         """Index of the first pose that collides, or None."""
         return _first(self.states == State.OCCUPIED)
+
+    @property
+    def first_occupied_m(self) -> Floats | None:
+        """(3,) centre of the body at the first pose that collides, metres, map frame, or None."""
+        return None if self.first_occupied is None else self.centres_m[self.first_occupied]
+
+    @property
+    def first_not_free_m(self) -> Floats | None:
+        """(3,) centre of the body at the first pose that collides or may collide, metres, map frame, or None."""
+        return None if self.first_not_free is None else self.centres_m[self.first_not_free]
 
     @property
     def first_not_free(self) -> int | None:
@@ -84,7 +101,7 @@ def _check(frozen: FrozenMap, centres_m: Floats, R: Floats, *, half_m: Floats, r
     kernels.body_states_into(
         frozen.grid, centres_m / edge_m, np.ascontiguousarray(R), half_m / edge_m, radius_m / edge_m, states
     )
-    return PathStates(states)
+    return PathStates(states, centres_m)
 
 
 def _first(true: npt.NDArray[np.bool_]) -> int | None:
@@ -172,4 +189,4 @@ def _worst(at_poses: PathStates, between: PathStates, segment: npt.NDArray[np.in
     """The worst state of each pose and of the samples on the way to it."""
     weights = WEIGHTS[at_poses.states]
     np.maximum.at(weights, segment + 1, WEIGHTS[between.states])
-    return PathStates(STATES[weights])
+    return PathStates(STATES[weights], at_poses.centres_m)

@@ -1,4 +1,7 @@
-"""Distance queries: along rays to the first occupied voxel, and from points to the nearest voxel in a state."""
+"""Distance queries: along rays to the first occupied voxel, and from points to the nearest voxel in a state.
+
+Where nothing is found, the distance is infinite, the point is NaN, and the voxel is `NO_VOXEL` along each axis.
+"""
 
 import math
 from dataclasses import dataclass
@@ -13,6 +16,8 @@ from cairn_map.queries.nearest_kernels import nearest_into
 from cairn_map.queries.occupancy_states import State
 from cairn_map.queries.ray_kernels import cast_into
 
+NO_VOXEL = int(np.iinfo(np.int64).min)
+"""Number, along each axis, of no voxel."""
 ONES = ~np.uint64(0)
 CHUNK = 1 << 14
 """Rays that are cast at a time: it bounds the memory for their unit directions."""
@@ -27,12 +32,19 @@ class RayEnds:
     states: npt.NDArray[np.uint8]
     """(N,) `State` of that voxel; FREE if the ray came to its maximum range."""
     voxels: npt.NDArray[np.int64]
-    """(N, 3) number of that voxel; of no meaning where there is none."""
+    """(N, 3) number of that voxel; `NO_VOXEL` where there is none."""
+    points_m: Floats
+    """(N, 3) where the ray enters it, metres, map frame; NaN where there is none."""
 
     @property
     def hit(self) -> npt.NDArray[np.bool_]:
         """(N,) True where an occupied voxel ended the ray."""
         return np.asarray(self.states == State.OCCUPIED)
+
+    def __repr__(self) -> str:
+        near_m = self.distance_m[self.hit]
+        span = f", {near_m.min():.3g} to {near_m.max():.3g} m away" if len(near_m) else ""
+        return f"RayEnds({len(self.states)} rays, {len(near_m)} hit{span})"
 
 
 def cast(
@@ -43,20 +55,19 @@ def cast(
     max_range_m: float,
     ends_in_unknown: bool,
 ) -> RayEnds:
-    """Ends of N rays, from (N, 3) origins along (N, 3) directions of any length other than 0."""
-    origins, directions = as_points(origins_m, "origins"), as_points(directions, "directions")
-    if origins.shape != directions.shape:
-        raise BadInputError("bad_points", f"as many directions as origins, got {len(directions)} and {len(origins)}")
+    """Ends of N rays, from N origins, or one, along N directions, or one, of any length other than 0."""
+    origins, directions = _as_many(_rows(origins_m, "origins"), _rows(directions, "directions"))
     if not max_range_m >= 0:
         raise BadInputError("bad_range", f"the maximum range must be 0 or more, got {max_range_m}")
     N, edge_m = len(origins), frozen.geometry.voxel_edge_m
-    ends = RayEnds(np.empty(N), np.empty(N, np.uint8), np.empty((N, 3), np.int64))
+    ends = RayEnds(np.empty(N), np.empty(N, np.uint8), np.empty((N, 3), np.int64), np.full((N, 3), np.nan))
     for start in range(0, N, CHUNK):
         part = slice(start, start + CHUNK)
+        units = _units(directions[part])
         inside = cast_into(
             frozen.grid,
             origins[part],
-            _units(directions[part]),
+            units,
             frozen.reach_m,
             max_range_m / edge_m,
             ONES if ends_in_unknown else np.uint64(0),
@@ -65,8 +76,33 @@ def cast(
             ends.voxels[part],
         )
         check_within(inside, frozen)
-    np.multiply(ends.distance_m, edge_m, out=ends.distance_m)
+        distance_m = ends.distance_m[part]
+        distance_m *= edge_m
+        ended = np.isfinite(distance_m)
+        ends.points_m[part][ended] = origins[part][ended] + units[ended] * distance_m[ended, None]
+        ends.voxels[part][~ended] = NO_VOXEL
     return ends
+
+
+def _rows(values: npt.ArrayLike, what: str) -> Floats:
+    """(N, 3) of (N, 3) numbers, or (1, 3) of three."""
+    return as_points(np.asarray(values)[None] if np.ndim(values) == 1 else values, what)
+
+
+def _as_many(origins: Floats, directions: Floats) -> tuple[Floats, Floats]:
+    """Both as many; one alone is repeated.
+
+    Raises:
+        BadInputError: kind `bad_points`.
+    """
+    N = max(len(origins), len(directions))
+    if {len(origins), len(directions)} - {1, N} or min(len(origins), len(directions)) == 0 < N:
+        raise BadInputError(
+            "bad_points",
+            f"as many directions as origins, or one of either, got {len(directions)} and {len(origins)}",
+        )
+    repeated = (np.repeat(each, N, axis=0) if len(each) < N else each for each in (origins, directions))
+    return next(repeated), next(repeated)
 
 
 def _units(directions: Floats) -> Floats:
@@ -90,12 +126,19 @@ class Nearest:
     distance_m: Floats
     """(N,) metres to the nearest point of the voxel, 0 inside it; infinite if there is none within the radius."""
     voxels: npt.NDArray[np.int64]
-    """(N, 3) number of the voxel, of one of them if several are as near; of the point's own if there is none."""
+    """(N, 3) number of the voxel, of one of them if several are as near; `NO_VOXEL` if there is none."""
+    points_m: Floats
+    """(N, 3) nearest point of that voxel, metres, map frame; NaN if there is none."""
 
     @property
     def found(self) -> npt.NDArray[np.bool_]:
         """(N,) True where there is a voxel within the radius."""
         return np.isfinite(self.distance_m)
+
+    def __repr__(self) -> str:
+        near_m = self.distance_m[self.found]
+        span = f", {near_m.min():.3g} to {near_m.max():.3g} m away" if len(near_m) else ""
+        return f"Nearest({len(self.distance_m)} points, {len(near_m)} found{span})"
 
 
 def nearest(frozen: FrozenMap, points_m: npt.ArrayLike, state: State, *, radius_m: float) -> Nearest:
@@ -104,7 +147,7 @@ def nearest(frozen: FrozenMap, points_m: npt.ArrayLike, state: State, *, radius_
     if not 0 <= radius_m < np.inf:
         raise BadInputError("bad_range", f"a radius must be finite and 0 or more, got {radius_m}")
     N, edge_m = len(points), frozen.geometry.voxel_edge_m
-    found = Nearest(np.empty(N), np.empty((N, 3), np.int64))
+    found = Nearest(np.empty(N), np.empty((N, 3), np.int64), np.full((N, 3), np.nan))
     inside = nearest_into(
         frozen.grid,
         points,
@@ -116,4 +159,8 @@ def nearest(frozen: FrozenMap, points_m: npt.ArrayLike, state: State, *, radius_
     )
     check_within(inside, frozen)
     np.multiply(found.distance_m, edge_m, out=found.distance_m)
+    there = found.found
+    low_m = found.voxels[there] * edge_m
+    found.points_m[there] = np.clip(points[there], low_m, low_m + edge_m)
+    found.voxels[~there] = NO_VOXEL
     return found

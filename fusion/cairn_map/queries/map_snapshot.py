@@ -45,6 +45,9 @@ class MapSnapshot:
     def __init__(self, frozen: FrozenMap) -> None:
         self._frozen = frozen
 
+    def __repr__(self) -> str:
+        return f"MapSnapshot({len(self._frozen.cells)} cells, {self.geometry})"
+
     def refreshed(self, whole: EvidenceMap) -> Self:
         """Snapshot of the map as it is now; only the cells that changed since this snapshot are read again."""
         return type(self)(freeze(whole, self._frozen.model, earlier=self._frozen))
@@ -111,8 +114,8 @@ class MapSnapshot:
         border is in the upper voxel. A voxel at the maximum range itself is still met.
 
         Args:
-            origins_m: (N, 3), anywhere.
-            directions: (N, 3), map frame, of any finite length but 0.
+            origins_m: (N, 3), anywhere; or one, for all directions.
+            directions: (N, 3), map frame, of any finite length but 0; or one, for all origins.
             max_range_m: 0 or more; infinite for as far as the map goes.
             ends_in_unknown: True if an unknown voxel ends a ray, too; else it is seen through.
         """

@@ -1,7 +1,9 @@
 """Search for the nearest occupied or unknown voxel. Lengths are in voxel edges, to the nearest point of the voxel.
 
 Bricks are searched in shells, the surfaces of growing cubes around the point's own brick, until the next shell is
-farther away than the voxel found. These kernels check nothing.
+farther away than the voxel found. Where the shells come to more places than the cells have for bricks, an occupied
+voxel is looked for in all cells instead: two cells far apart make the box of a small map large. These kernels check
+nothing.
 """
 
 import numba as nb
@@ -9,6 +11,8 @@ import numpy as np
 
 from cairn_map.arrays import Floats, Ints
 from cairn_map.evidence.grid import NANOMETRES
+from cairn_map.kernels.integer_kernels import signed
+from cairn_map.kernels.morton_kernels import squeeze
 from cairn_map.queries.occupancy_kernels import KNOWN_BITS, OCCUPIED_BITS, Grid, U, brick_of, voxel_of, x_in_block
 from cairn_map.queries.point_kernels import is_within
 
@@ -42,6 +46,7 @@ def search_into(grid: Grid, start: Floats, own: Ints, radius: float, unknown: bo
     """Distance from one point to the nearest voxel, infinite if there is none; writes the voxel found."""
     best = np.nextafter(radius * radius, np.inf)  # squared; what lies at the radius itself still counts
     found = False
+    places = 0
     # Bounds of the search, in bricks: the box of all cells.
     bx, by, bz = own[0] >> 3, own[1] >> 3, own[2] >> 3
     low_x, low_y, low_z = grid.low[0] >> 3, grid.low[1] >> 3, grid.low[2] >> 3
@@ -59,18 +64,46 @@ def search_into(grid: Grid, start: Floats, own: Ints, radius: float, unknown: bo
             break
         for x in range(max(bx - shell, low_x), min(bx + shell, high_x) + 1):
             for y in range(max(by - shell, low_y), min(by + shell, high_y) + 1):
+                # What is unknown is found where no brick is, so those shells end by themselves.
+                if places > grid.bricks.size and not unknown:
+                    nearer = search_all_into(grid, start, best, voxel)
+                    return np.sqrt(nearer) if found or nearer < best else np.inf
                 # A column of the shell: all of it on the cube's sides, else only its two ends.
                 step = 1 if abs(x - bx) == shell or abs(y - by) == shell else max(2 * shell, 1)
                 from_z = bz - shell
                 if step == 1:
                     from_z = max(from_z, low_z)
-                for z in range(from_z, min(bz + shell, high_z) + 1, step):
+                to_z = min(bz + shell, high_z)
+                places += 1 + max(0, to_z - from_z) // step
+                for z in range(from_z, to_z + 1, step):
                     if z < low_z or box_distance_squared(start, 8 * x, 8 * y, 8 * z, 8) >= best:
                         continue
                     closer = search_brick_into(grid, start, x, y, z, best, unknown, voxel)
                     if closer < best:
                         best, found = closer, True
     return np.sqrt(best) if found else np.inf
+
+
+@nb.njit(nogil=True)
+def search_all_into(grid: Grid, start: Floats, best: float, voxel: Ints) -> float:
+    """Least squared distance to an occupied voxel of any brick, if it is below `best`, else `best`; writes it."""
+    for slot in range(grid.cells.shape[0]):
+        x0, y0, z0 = (
+            grid.cells[slot, 0] << grid.depth,
+            grid.cells[slot, 1] << grid.depth,
+            grid.cells[slot, 2] << grid.depth,
+        )
+        if box_distance_squared(start, x0, y0, z0, 1 << grid.depth) >= best:
+            continue
+        for b in range(grid.bricks.shape[1]):
+            if grid.bricks[slot, b] < 0:
+                continue
+            # b is the brick's Morton code in the cell.
+            x, y, z = signed(squeeze(U(b))), signed(squeeze(U(b >> 1))), signed(squeeze(U(b >> 2)))
+            bx, by, bz = (x0 >> 3) + x, (y0 >> 3) + y, (z0 >> 3) + z
+            if box_distance_squared(start, 8 * bx, 8 * by, 8 * bz, 8) < best:
+                best = search_brick_into(grid, start, bx, by, bz, best, False, voxel)
+    return best
 
 
 @nb.njit(nogil=True)

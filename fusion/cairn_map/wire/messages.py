@@ -40,6 +40,8 @@ Time = Annotated[float, Field(allow_inf_nan=False)]
 CURSORS_MAX = 100_000
 CellNumbers = Annotated[list[tuple[int, int, int]], Field(max_length=CURSORS_MAX), FailFast()]
 CursorGroup = tuple[CursorText | None, CellNumbers]
+NAME_CHARACTERS = 24
+"""Characters of a commit's id, by which the length of a log entry's note is counted."""
 WANTED_MAX = 256
 """Commits that a header wants again."""
 DAMAGED_MAX = 256
@@ -188,6 +190,9 @@ class MissingRequest(_LongRequest):
     """Kinds of frame that the asker can use now; `full` is always implied."""
     near: tuple[int, int, int] | None = None
     """Frames of the cells next to this one come first, then those farther away; None: the newest everywhere."""
+    since: CursorText | Literal["cursor"] | None = None
+    """State whose vector the asker holds: the header's then names only what was folded since. `cursor`: that of
+    `cursor`; None: it holds none."""
     begun: tuple[tuple[int, int, int], Annotated[int, Field(ge=1)], ShaText] | None = None
     """Cell, bytes of its frame's payload that came before a cut, SHA-256 of them: only the rest is sent."""
     known: Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")] | None = None
@@ -199,7 +204,9 @@ class ReplyHeader(_Model):
 
     to: CursorText
     vector: VectorJson
-    """Ids folded at or before `to`."""
+    """Ids folded at or before `to`, and after `since` if that is there."""
+    since: CursorText | Literal["cursor"] | None = None
+    """`since` of the request, if `vector` begins there; None: `vector` is whole."""
     stable: VectorJson
     """Ids of the asker's robot and of the operator that no restore can lose any more."""
     pending: VectorJson = {}
@@ -222,7 +229,7 @@ class ReplyHeader(_Model):
 
     @property
     def coverage(self) -> VersionVector:
-        """`vector`, parsed."""
+        """`vector` of a header without `since`, parsed."""
         return version_vector_from_json(self.vector)
 
     @property
@@ -234,6 +241,23 @@ class ReplyHeader(_Model):
     def stable_vector(self) -> VersionVector:
         """`stable`, parsed."""
         return version_vector_from_json(self.stable)
+
+    def whole(self, held: "ReplyHeader | None", *, since: str | None) -> "ReplyHeader":
+        """Header whose vector is whole: with the ids of the one held, at whose state this one's vector may begin.
+
+        Args:
+            held: whole header of the state that the request stated in `since`.
+            since: `since` of the request.
+
+        Raises:
+            DamagedDataError: kind `bad_message`: it begins at another state.
+        """
+        if self.since is None:
+            return self
+        if held is None or self.since != since:
+            raise DamagedDataError("bad_message", f"the header's vector begins at {self.since}, which was not stated")
+        vector = held.coverage.union(self.coverage)
+        return self.model_copy(update={"vector": vector.to_json(), "since": None})
 
     def check(self) -> None:
         """Parse every text once: for a reader who keeps the header.
@@ -320,6 +344,13 @@ class LogEntry(_Model):
     """Place of the rig at the commit's last scan, metres, map frame; None: it has no scans, or is not kept any more."""
     via: str | None = None
     """Name of the token of the relay that handed it over; None: its own robot did, or the server made it."""
+    note: Annotated[str, Field(max_length=1024)] = ""
+    """Note of its author; empty, too, once its evidence is not kept."""
+
+    @property
+    def names(self) -> int:
+        """Count of the commits that it names, and of those whose ids would be as long as its note."""
+        return len(self.retracts) + len(self.note) // NAME_CHARACTERS
 
 
 class Problem(BaseModel):

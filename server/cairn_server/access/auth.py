@@ -18,7 +18,8 @@ import time
 from dataclasses import dataclass
 from enum import StrEnum
 
-from cairn_map.errors import DeniedError
+from cairn_map.commits.ids import SERVERS_OWN, RobotName
+from cairn_map.errors import BadInputError, DeniedError
 from cairn_server.settings import Settings
 from cairn_server.store.store import Store
 from cairn_server.store.store_rows import MapRow, Token
@@ -54,7 +55,7 @@ class Caller:
 
     def may_author(self, robot: str) -> bool:
         """True if this caller may push commits of this robot."""
-        return self.role is Role.ADMIN or self.robot == robot
+        return self.role is Role.ADMIN or (self.robot == robot and robot not in RESERVED_ROBOT_NAMES)
 
     def counts_on(self, map_number: int | None) -> bool:
         """True if the token counts on a map (None: on the server as a whole)."""
@@ -64,7 +65,19 @@ class Caller:
 ADMIN_FILE, ENROLLER_FILE, LOCAL = Caller(Role.ADMIN, name="admin"), Caller(Role.ENROLLER, name="enroller"), "local"
 UPSTREAM = Caller(Role.RELAY, name="upstream")
 """This server's own relay, which brings the upstream server's commits."""
+RESERVED_ROBOT_NAMES = frozenset({*SERVERS_OWN, RobotName("main")})
+"""Names that no robot has: servers speak in them."""
 RESERVED_TOKEN_NAMES = frozenset({ADMIN_FILE.name, ENROLLER_FILE.name, LOCAL, UPSTREAM.name, "server"})
+
+
+def check_robot_name(name: str) -> None:
+    """Refuse names that servers speak in.
+
+    Raises:
+        BadInputError: kind `reserved_name`.
+    """
+    if name in RESERVED_ROBOT_NAMES:
+        raise BadInputError("reserved_name", f"{name} is not a robot's name; reserved are operator, initial, main")
 
 
 def new_token() -> str:
@@ -83,14 +96,19 @@ def caller_of(token: str | None, row: MapRow | None, store: Store, settings: Set
     Raises:
         DeniedError: kind `no_token`, `bad_token`, also on a map that the token is not for, or `unconfirmed_token`.
     """
-    if token is None:
+    return caller_of_hash(None if token is None else token_hash(token), row, store, settings)
+
+
+def caller_of_hash(secret_hash: bytes | None, row: MapRow | None, store: Store, settings: Settings) -> Caller:
+    """Caller that showed a token of this SHA-256; as `caller_of`."""
+    if secret_hash is None:
         if settings.admin_token is None:
             return Caller(Role.ADMIN, name=LOCAL)
         raise DeniedError(
             "no_token",
             "this server wants a token: Authorization: Bearer TOKEN (the cairn command: --token, CAIRN_TOKEN)",
         )
-    caller = _holder(token, store, settings)
+    caller = _holder(secret_hash, store, settings)
     if caller is None or not (row is None or caller.counts_on(row.number)):
         raise bad_token()
     return caller
@@ -140,8 +158,8 @@ def has_ended(token: Token, settings: Settings, *, now_s: float, age_s: float) -
     return age_s >= max(token.created_age_s, token.used_age_s) + settings.branch_expiry_s
 
 
-def _holder(token: str, store: Store, settings: Settings) -> Caller | None:
-    known = store.tokens.of_hash(token_hash(token))
+def _holder(secret_hash: bytes, store: Store, settings: Settings) -> Caller | None:
+    known = store.tokens.of_hash(secret_hash)
     if known is not None:
         if has_ended(known, settings, now_s=time.time(), age_s=store.age.now_s()):
             return None
@@ -153,12 +171,12 @@ def _holder(token: str, store: Store, settings: Settings) -> Caller | None:
             )
         store.tokens.used(known.name)
         return Caller(Role(known.role), known.robot, known.name, known.map_number)
-    if _is(token, settings.admin_token):
+    if _is(secret_hash, settings.admin_token):
         return ADMIN_FILE
-    if _is(token, settings.enrolment_token):
+    if _is(secret_hash, settings.enrolment_token):
         return ENROLLER_FILE
     return None
 
 
-def _is(token: str, expected: str | None) -> bool:
-    return expected is not None and hmac.compare_digest(token.encode(), expected.encode())
+def _is(secret_hash: bytes, expected: str | None) -> bool:
+    return expected is not None and hmac.compare_digest(secret_hash, token_hash(expected))

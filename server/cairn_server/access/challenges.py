@@ -1,7 +1,7 @@
 """Challenges for proofs of robots' keys, and the check of a proof.
 
-A challenge is the time of its making and a code over it by a secret of this process, so that none is kept: it is good
-for a minute, and not after a new start.
+A challenge is the time of its making and a code over it by a secret, so that none is kept: it is good for a minute. The
+secret is this process's, and gone with it, or that of a store on which several servers work.
 """
 
 import hashlib
@@ -20,10 +20,11 @@ TIME_DIGITS = 16
 
 
 class Challenges:
-    """Challenges of one process; called from many threads."""
+    """Challenges by one secret; called from many threads."""
 
-    def __init__(self, *, steady_s: Callable[[], float] = time.monotonic) -> None:
-        self._secret = secrets.token_bytes(32)
+    def __init__(self, *, secret: bytes | None = None, steady_s: Callable[[], float] = time.monotonic) -> None:
+        """Servers that take each other's challenges share `secret` and clock; without it, it is random."""
+        self._secret = secret or secrets.token_bytes(32)
         self._steady_s = steady_s
 
     def new(self) -> str:

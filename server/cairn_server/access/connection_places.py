@@ -1,8 +1,10 @@
 """Places of connections, so that no client takes those of the others.
 
     stranger  showed no good token yet       a quarter as many places as `limit`, for all strangers together
-    known     showed a good token            `limit` places, a sixteenth of them for one token; admins have no share
-    proxy     comes from a trusted proxy     not counted; each of its requests is, as a connection is
+    known     showed a good token            `limit` places, a sixteenth of them for one token; admins have no share.
+                                             Where all are taken, the token that has most of them loses its oldest
+                                             one to a token that has fewer: a robot has a token on each of its maps
+    proxy     comes from a trusted proxy     not counted; each of its requests is, as a connection is, and none is cut
 
 A new stranger finds a place: where all are taken, the address that has most of them loses its oldest one. So silent
 connections push out each other, and a robot that shows its token within a round trip stays. Each stays for half a
@@ -33,9 +35,10 @@ Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 class ConnectionPlace:
     """Place of one connection."""
 
-    def __init__(self, address: str, cut: Callable[[], None], now_s: float) -> None:
+    def __init__(self, address: str, cut: Callable[[], None] | None, now_s: float) -> None:
         self.address = address
         self.cut = cut
+        """Ends it; None: a request that comes through a proxy, and ends by itself."""
         self.since_s = now_s
         self.holder: Hashable = None
         """Token that was seen on it; None: a stranger's."""
@@ -54,12 +57,13 @@ class ConnectionPlaces:
         self._proxies = networks(trusted_proxies)
         self._strangers: dict[ConnectionPlace, None] = {}  # oldest first
         self._good: OrderedDict[str, None] = OrderedDict()  # longest ago first
-        self._of: Counter[Hashable] = Counter()
+        self._of: dict[Hashable, dict[ConnectionPlace, None]] = {}
+        """Places by holder of a token, oldest first; a holder without a place is not in it."""
 
     @property
     def taken(self) -> tuple[int, int]:
         """Places of strangers and of holders of tokens that are taken."""
-        return len(self._strangers), self._of.total()
+        return len(self._strangers), sum(map(len, self._of.values()))
 
     def enter(self, address: str, cut: Callable[[], None]) -> ConnectionPlace | None:
         """Place of a new connection, which `cut` ends, perhaps at once; None: it comes from a trusted proxy."""
@@ -79,15 +83,16 @@ class ConnectionPlaces:
         """
         if place.holder == holder:
             return
-        if self._of[holder] >= self._share:
+        own = len(self._of.get(holder, ()))
+        if own >= self._share:
             message = f"{self._share} connections showed this token; close one of them"
             raise UnreachableError("busy", message, retry_after_s=5.0)
-        if self._of.total() - (place.holder is not None) >= self._limit:
+        if self.taken[1] - (place.holder is not None) >= self._limit and not self._cut_of_most(own):
             raise UnreachableError("busy", f"all {self._limit} connections are taken", retry_after_s=5.0)
         self._forget(place)
         self._note_good(place.address)
         place.holder = holder
-        self._of[holder] += 1
+        self._of.setdefault(holder, {})[place] = None
 
     def begin(self, holder: Hashable) -> ConnectionPlace:
         """Place of one request that comes through a proxy.
@@ -95,7 +100,7 @@ class ConnectionPlaces:
         Raises:
             UnreachableError: kind `busy`, as `note`.
         """
-        place = ConnectionPlace("", lambda: None, self._steady_s())
+        place = ConnectionPlace("", None, self._steady_s())
         self.note(place, holder)
         return place
 
@@ -107,9 +112,21 @@ class ConnectionPlaces:
     def _forget(self, place: ConnectionPlace) -> None:
         self._strangers.pop(place, None)
         if place.holder is not None:
-            self._of[place.holder] -= 1
-            if not self._of[place.holder]:
+            held = self._of[place.holder]
+            del held[place]
+            if not held:
                 del self._of[place.holder]
+
+    def _cut_of_most(self, own: int) -> bool:
+        """Cut the oldest connection of the token that has most, if it still has more than the newcomer then has."""
+        most = max(self._of.values(), key=len)
+        # With one more only they would push out each other for ever.
+        oldest = next((place for place in most if place.cut is not None), None) if len(most) > own + 1 else None
+        if oldest is None:
+            return False
+        self.leave(oldest)
+        _cut(oldest)
+        return True
 
     def _note_good(self, address: str) -> None:
         self._good[address] = None
@@ -127,10 +144,15 @@ class ConnectionPlaces:
         is_flood = oldest.address == newest.address and newest.since_s - oldest.since_s < STAY_S
         place = newest if is_flood else oldest
         del self._strangers[place]
-        place.cut()
+        _cut(place)
 
     def _is_proxy(self, address: str) -> bool:
         return bool(self._proxies) and any(_parsed(address) in network for network in self._proxies)
+
+
+def _cut(place: ConnectionPlace) -> None:
+    if place.cut is not None:
+        place.cut()
 
 
 def networks(text: str) -> tuple[Network, ...]:

@@ -3,8 +3,8 @@
 A quota is checked after the commit's head is read and before its evidence is decoded, that of bricks after it is
 checked, which counts them. It is taken at once, so that a
 robot's parallel pushes share it, and given back if the commit is refused or was known. An exceeded rate (429) passes
-with time; a commit that is too large (400) does not. Days are those of UTC; after a start, a day's use is read from the
-store.
+with time; a commit that is too large (400) does not. Days are those of UTC. The accounts are this process's own
+(`use_accounts`), or those that all servers of the store share.
 """
 
 import math
@@ -19,13 +19,13 @@ from cairn_map.errors import BadInputError, UnreachableError
 from cairn_map.evidence.grid import CELL_LIMIT, CellKey
 from cairn_map.kernels.morton_kernels import deinterleave
 from cairn_server.access.auth import UPSTREAM, Caller, Role
-from cairn_server.access.rate_limits import Allowance, allowance
+from cairn_server.access.use_accounts import DAY_S, OwnUseAccounts
 from cairn_server.settings import Quotas
+from cairn_server.store.replica_notes import UseAccounts, UseBounds
 from cairn_server.store.shares import REGION_BITS
 from cairn_server.store.store import Store
 from cairn_server.store.store_rows import MapRow, Robot, Use, relay_of, unpaid_bricks
 
-DAY_S = 86_400
 BOX_EVERY_S = 5.0
 """Least time between two readings of a robot's box while its commits beyond it are refused: retracts make it smaller.
 """
@@ -51,10 +51,19 @@ class Meter:
         self._quotas = quotas
         self._wall_s = wall_s
         self._steady_s = steady_s
+        self._is_shared = store.replicas is not None
+        self.accounts: UseAccounts = (
+            OwnUseAccounts(store.uses, wall_s=wall_s, steady_s=steady_s)
+            if store.replicas is None
+            else store.replicas.uses
+        )
+        self._bounds = UseBounds(
+            size_bytes=quotas.bytes_per_day,
+            cells=quotas.cells_per_day,
+            bricks=quotas.bricks_per_day,
+            commits_per_minute=quotas.commits_per_minute,
+        )
         self._lock = threading.Lock()
-        self._day = -1
-        self._used: dict[Robot, Use] = {}
-        self._minutes: dict[Robot, Allowance] = {}
         self._reaches: dict[Robot, _Reach] = {}
 
     @contextmanager
@@ -86,15 +95,11 @@ class Meter:
         robot = row.number, relay_of(via) if via else caller.robot or caller.name
         use, box, is_metered = Use(size_bytes, len(cells)), _box_of(cells), caller != UPSTREAM
         reach = self._check_commit(row, use, author, box)
-        with self._lock:
-            if is_metered:
-                self._take(robot, use)
-            day = self._day
+        day = self._take(robot, use, commits=1) if is_metered else 0
 
         def charge(more: Use) -> None:
-            with self._lock:
-                if is_metered:
-                    self._take_of_day(robot, more)
+            if is_metered:
+                self._take(robot, more, commits=0)
 
         spending = Spending(use, charge)
         try:
@@ -102,9 +107,8 @@ class Meter:
         finally:
             if spending.is_kept and reach is not None and box is not None:
                 reach.widen(box)
-            with self._lock:
-                if is_metered and not spending.is_kept:
-                    self._give_back(robot, spending.use, day)
+            if is_metered and not spending.is_kept:
+                self.accounts.give_back(robot, spending.use, day=day, commits=1)
 
     def _check_commit(self, row: MapRow, use: Use, author: str, box: Box | None) -> "_Reach | None":
         """Refuse what no waiting mends; the reach of the author's cells, if the commit may widen it."""
@@ -115,7 +119,7 @@ class Meter:
         if most_m is None or box is None:
             return None
         with self._lock:
-            reach = self._reaches.setdefault((row.number, author), _Reach())
+            reach = self._reaches.setdefault((row.number, author), _Reach(is_shared=self._is_shared))
         edge_m = row.geometry.cell_edge_m
 
         def regions() -> Box | None:
@@ -131,28 +135,19 @@ class Meter:
             )
         return reach
 
-    def _take(self, robot: Robot, use: Use) -> None:
-        before = self._take_of_day(robot, use)
-        try:
-            self._take_of_minute(robot)
-        except UnreachableError:
-            self._used[robot] = before
-            raise
+    def _take(self, robot: Robot, use: Use, *, commits: int) -> int:
+        """Take use of the day, and commits of the minute; the day.
 
-    def _take_of_day(self, robot: Robot, use: Use) -> Use:
-        """Take from the quotas of the day, and return what was taken of them before."""
-        now_s = self._wall_s()
-        day = int(now_s // DAY_S)
-        if self._day != day:
-            self._used = dict(self._store.uses.since(day * DAY_S))
-            self._day = day
-        before = self._used.get(robot, Use())
-        used = before + use
-        until_midnight_s = (self._day + 1) * DAY_S - now_s
+        Raises:
+            UnreachableError: kind `quota`; nothing is taken.
+        """
+        answer = self.accounts.take(robot, use, self._bounds, commits=commits)
+        used, quotas = answer.of_day, self._quotas
+        until_midnight_s = (answer.day + 1) * DAY_S - self._wall_s()
         for what, setting, spent, most in (
-            ("bytes", "bytes_per_day", used.size_bytes, self._quotas.bytes_per_day),
-            ("cells", "cells_per_day", used.cells, self._quotas.cells_per_day),
-            ("bricks beyond one for each byte", "bricks_per_day", used.bricks, self._quotas.bricks_per_day),
+            ("bytes", "bytes_per_day", used.size_bytes, quotas.bytes_per_day),
+            ("cells", "cells_per_day", used.cells, quotas.cells_per_day),
+            ("bricks beyond one for each byte", "bricks_per_day", used.bricks, quotas.bricks_per_day),
         ):
             if most is not None and spent > most:
                 raise _quota(
@@ -160,23 +155,9 @@ class Meter:
                     f"or have an administrator raise quotas.{setting}",
                     until_midnight_s,
                 )
-        self._used[robot] = used
-        return before
-
-    def _take_of_minute(self, robot: Robot) -> None:
-        most = self._quotas.commits_per_minute
-        if most is None:
-            return
-        now_s = self._steady_s()
-        wait_s = self._minutes.setdefault(robot, allowance(most, most / 60, now_s=now_s)).take(now_s)
-        if wait_s:
-            raise _quota(f"{robot[1]} may push {most} commits a minute", wait_s)
-
-    def _give_back(self, robot: Robot, use: Use, day: int) -> None:
-        if day == self._day:
-            self._used[robot] -= use
-        if robot in self._minutes:
-            self._minutes[robot].left += 1
+        if answer.wait_s:
+            raise _quota(f"{robot[1]} may push {quotas.commits_per_minute} commits a minute", answer.wait_s)
+        return answer.day
 
 
 class Spending:
@@ -211,7 +192,9 @@ def _charge_nothing(_: Use) -> None:
 class _Reach:
     """Box of the cells in which one robot has evidence, folded or not; thread-safe."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, is_shared: bool) -> None:
+        """`is_shared`: other servers of the store may accept commits of this robot, too."""
+        self._is_shared = is_shared
         self._lock = threading.Lock()
         self._box: Box | None = None
         self._next_s = -math.inf
@@ -223,11 +206,15 @@ class _Reach:
         """Longest edge of the robot's box and another one together, in cells; read again if it exceeds `within`."""
         with self._lock:
             is_known = self._next_s > -math.inf
-            edge = _edge_cells(_widened(self._box, box)) if is_known else math.inf
+            both = _widened(self._box, box)
             begun_s = steady_s()
-            if edge > within and begun_s >= self._next_s:
+            if not is_known or (_edge_cells(both) > within and begun_s >= self._next_s):
                 self._box = read()
                 self._next_s = begun_s + max(BOX_EVERY_S, BOX_PAUSE_FACTOR * (steady_s() - begun_s))
+            elif self._is_shared and both != self._box and _edge_cells(both) <= within:
+                # A robot is seldom at its border: what another server accepted there is read for each commit there.
+                found = read()
+                self._box = _widened(self._box, found) if found is not None else self._box
             return _edge_cells(_widened(self._box, box))
 
     def widen(self, box: Box) -> None:

@@ -5,7 +5,7 @@ import time
 from cairn_map.commits.ids import robot_name
 from cairn_map.errors import BadInputError
 from cairn_map.wire.access_messages import CreateToken, NewSecret, TokenInfo
-from cairn_server.access.auth import RESERVED_TOKEN_NAMES, Caller, new_token, token_hash
+from cairn_server.access.auth import RESERVED_TOKEN_NAMES, Caller, check_robot_name, new_token, token_hash
 from cairn_server.store.store import Store
 from cairn_server.store.store_rows import Token
 
@@ -20,6 +20,8 @@ def create_token(store: Store, name: str, request: CreateToken, *, by: Caller) -
     """
     if robot_name(name) in RESERVED_TOKEN_NAMES:
         raise BadInputError("reserved_name", f"the audit log means something else by {name}; take another name")
+    if request.robot is not None:
+        check_robot_name(request.robot)
     now_s = time.time()
     token = Token(
         name=name,

@@ -16,29 +16,39 @@ The thread that folds reads no evidence to begin or to write a plan: what a comm
 import os
 import threading
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
-from cairn_map.commits.cursor import ENTRY_FOLD, Cursor, next_chain
+from cairn_map.commits.cursor import Cursor, next_chain
 from cairn_map.commits.ids import CommitId
-from cairn_map.evidence.grid import Geometry
+from cairn_map.evidence.grid import CellKey, Geometry
 from cairn_server.folding.cell_cache import CellCache
 from cairn_server.folding.commit_work import part_of
+from cairn_server.folding.fold_memory import FoldMemory
 from cairn_server.folding.folding import FoldStore, plan_fold
 from cairn_server.store.stamps import raised_stamps
 from cairn_server.store.store import Snapshot
-from cairn_server.store.store_rows import CellRow, CellState, Entry, Fold, Head, MapRow, NamedCommit, StoredCommit
+from cairn_server.store.store_rows import CellRow, Entry, Fold, MapRow, NamedCommit, StoredCommit
 
 NICE = 10
 """Priority of the thread: a tenth of the processor if others need it."""
+
+
+class _CellState(NamedTuple):
+    """State of a stored cell that a plan adds to."""
+
+    key: CellKey
+    lm: int
+    digest: bytes
 
 
 @dataclass(frozen=True, slots=True)
 class _Ground:
     """State of a map that a plan depends on."""
 
-    cells: tuple[CellState, ...]
+    cells: tuple[_CellState, ...]
     """Each stored cell of the plan."""
     commits: tuple[NamedCommit, ...]
     """Each commit that is folded or named."""
@@ -47,13 +57,16 @@ class _Ground:
 class BackgroundPlan:
     """One plan and the thread that makes it."""
 
-    def __init__(self, store: FoldStore, row: MapRow, commits: Sequence[StoredCommit], *, cells_bytes: int) -> None:
-        """Start to plan folding some pending commits, with so much memory for the cells under change."""
+    def __init__(
+        self, store: FoldStore, row: MapRow, commits: Sequence[StoredCommit], memory: FoldMemory, *, cells_bytes: int
+    ) -> None:
+        """Start to plan folding some pending commits; the cells under change have so much of the memory."""
         self.row = row
         self.commits = tuple(commits)
         self.seconds = 0.0
         """Time that it took."""
         self._store = _NotingStore(store)
+        self._memory = memory
         self._fold: Fold | None = None
         with store.snapshot(row) as snapshot:
             self._head = snapshot.head
@@ -85,10 +98,10 @@ class BackgroundPlan:
         with self._store.snapshot(self.row) as snapshot:
             head = snapshot.head
             is_same = self._ground_in(snapshot) == self._ground
-        if not is_same or any(commit.due_from is None and commit.id in head.vector for commit in self.commits):
+        if not is_same:
             return None
         known = self._store.known | {commit.number: (commit.id, commit.sha) for commit in self.commits}
-        fold = moved_fold(self._fold, head, known, self.row.geometry)
+        fold = moved_fold(self._fold, head, known, self.row.geometry, self._memory)
         if not self._store.fold(self.row, fold):
             return None
         self._store.write_notes()
@@ -98,8 +111,8 @@ class BackgroundPlan:
         with suppress(OSError):
             os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICE)
         start_s = time.monotonic()
-        cache = CellCache(self.row.geometry, limit_bytes=cells_bytes)
-        cache.begin(self._head.cursor)
+        cache = CellCache(self.row.geometry, self._memory, limit_bytes=cells_bytes)
+        cache.begin(self._head)
         # Whatever it is: folding without a plan meets it again, in the thread that can report it.
         with suppress(Exception):
             fold = plan_fold(self._store, self.row, self._head, self.commits, cache)
@@ -108,38 +121,46 @@ class BackgroundPlan:
 
     def _ground_in(self, snapshot: Snapshot) -> _Ground:
         commits = {commit.id for commit in self.commits} | self.named
-        return _Ground(tuple(snapshot.cell_states(self.cells)), tuple(snapshot.named(sorted(commits))))
+        cells = (_CellState(cell.key, cell.lm, cell.digest) for cell in snapshot.cells_of(self.cells))
+        return _Ground(tuple(cells), tuple(snapshot.named(sorted(commits))))
 
 
-def moved_fold(fold: Fold, head: Head, known: dict[int, tuple[CommitId, bytes]], geometry: Geometry) -> Fold:
+def moved_fold(
+    fold: Fold, base: Cursor, known: dict[int, tuple[CommitId, bytes]], geometry: Geometry, memory: FoldMemory
+) -> Fold:
     """The same fold on top of a newer state, in which its cells are unchanged.
 
     Args:
         fold: made from an older state.
-        head: of the newer state.
+        base: the newer state.
         known: id and SHA-256 of each commit of its entries, by number.
         geometry: of the map.
+        memory: for its cells.
     """
-    base, chain = head.cursor, head.cursor.chain
+    chain = base.chain
     entries: list[Entry] = []
     for entry in fold.entries:
         chain = next_chain(chain, entry.kind, *known[entry.commit])
         entries.append(replace(entry, chain=chain))
-    folded = [known[entry.commit][0] for entry in entries if entry.kind == ENTRY_FOLD]
     return replace(
         fold,
         base=base,
         head=Cursor(base.log_id, base.seq + len(entries), chain),
-        vector=head.vector.with_commits(folded),
         entries=tuple(entries),
-        cells=tuple(_moved_cell(cell, fold.base.seq, base.seq - fold.base.seq, geometry) for cell in fold.cells),
+        cells=_moved_cells(fold.cells, fold.base.seq, base.seq - fold.base.seq, geometry, memory),
     )
+
+
+def _moved_cells(
+    cells: Iterable[CellRow], after: int, by: int, geometry: Geometry, memory: FoldMemory
+) -> Iterable[CellRow]:
+    if by == 0:
+        return cells
+    return memory.spool(_moved_cell(cell, after, by, geometry) for cell in cells)
 
 
 def _moved_cell(cell: CellRow, after: int, by: int, geometry: Geometry) -> CellRow:
     """A cell whose stamps of the entries `after` one, and its own, are raised."""
-    if by == 0:
-        return cell
     stamps = raised_stamps(cell.stamps, after, by, depth=geometry.depth, lm=cell.lm)
     return replace(cell, lm=cell.lm + by, stamps=stamps)
 

@@ -1,6 +1,5 @@
 """The cell index, a page at a time."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 from cairn_map.commits.cursor import ENTRY_FOLD
@@ -10,6 +9,7 @@ from cairn_map.evidence.grid import CellKey, cell_from_text, cell_key, cell_of_k
 from cairn_map.wire.messages import INDEX_PAGE, CellEntry
 from cairn_server.store.store import Snapshot
 from cairn_server.store.store_rows import CellRow
+from cairn_server.store.tiles import Box
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -19,8 +19,8 @@ class IndexPage:
     after: CellKey | None = None
     """Number of the cell before the page; None: from the first cell on."""
     limit: int = INDEX_PAGE
-    inside: Callable[[tuple[int, int, int]], bool] | None = None
-    """Test that a cell has to pass; None: all cells do."""
+    box: Box | None = None
+    """Box of the cells; None: all."""
     is_hottest_asked: bool = False
     """True if each entry has its cell's hottest temperature."""
     is_held_asked: bool = False
@@ -34,16 +34,8 @@ TOUCHES_MAX = 32
 
 def entries_of(snapshot: Snapshot, page: IndexPage) -> list[CellEntry]:
     """Entries of the cells that were ever touched, emptied ones included, by rising number; one page of them."""
-    found: list[CellEntry] = []
-    after = -1 if page.after is None else page.after
-    while len(found) < page.limit:
-        rows = list(snapshot.cells(after_key=after, limit=page.limit))
-        inside = (row for row in rows if page.inside is None or page.inside(cell_of_key(row.key)))
-        found += (_asked_entry(snapshot, row, page) for row in inside)
-        if len(rows) < page.limit:
-            break
-        after = rows[-1].key
-    return found[: page.limit]
+    rows = snapshot.cells(after_key=-1 if page.after is None else page.after, limit=page.limit, box=page.box)
+    return [_asked_entry(snapshot, row, page) for row in rows]
 
 
 def _entry(row: CellRow) -> CellEntry:
@@ -80,8 +72,8 @@ def _held_lm(snapshot: Snapshot, key: CellKey) -> int | None:
     return None
 
 
-def box_from_text(text: str) -> Callable[[tuple[int, int, int]], bool]:
-    """Test of cells for the box written `i0,j0,k0,i1,j1,k1`, both corners included.
+def box_from_text(text: str) -> Box:
+    """Lowest and highest cell of the box written `i0,j0,k0,i1,j1,k1`, both corners included.
 
     Raises:
         BadInputError: kind `bad_box`, or of a cell that cannot be.
@@ -92,4 +84,4 @@ def box_from_text(text: str) -> Callable[[tuple[int, int, int]], bool]:
         cell_key(corner)
     if any(first > last for first, last in zip(low, high, strict=True)):
         raise BadInputError("bad_box", f"a box is i0,j0,k0,i1,j1,k1 with the lower corner first, got {text!r}")
-    return lambda cell: all(a <= n <= b for a, n, b in zip(low, cell, high, strict=True))
+    return low, high

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from cairn_map.evidence.grid import CellKey
 from cairn_server.folding.cells_at_rest import DamagedCellError, sound_cell
 from cairn_server.folding.damaged_cells import DamagedCells, heal_cell, keep_healed
+from cairn_server.store.history import head_of
 from cairn_server.store.store import Store
 from cairn_server.store.store_rows import CellRow, Head, MapRow
 
@@ -58,7 +59,7 @@ class Cells:
             DamagedCellError: kind `damaged_store`: it is damaged and cannot be rebuilt from the log.
         """
         with self.reading(row) as faults, self._store.snapshot(row) as snapshot:
-            return sound_cell(snapshot, key, row.geometry, faults.healed), snapshot.head
+            return sound_cell(snapshot, key, row.geometry, faults.healed), head_of(snapshot)
 
     def unchecked(self, row: MapRow, key: CellKey) -> tuple[CellRow | None, Head]:
         """One cell whose bytes may be damaged: for callers that decode them, or need the digest only.
@@ -67,7 +68,7 @@ class Cells:
             DamagedDataError: kind `damaged_store`: it cannot be read at all.
         """
         with self._store.snapshot(row) as snapshot:
-            return snapshot.cell(key), snapshot.head
+            return snapshot.cell(key), head_of(snapshot)
 
     def damaged(self, row: MapRow) -> frozenset[CellKey]:
         """Cells of a map known to be damaged."""

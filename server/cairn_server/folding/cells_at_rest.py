@@ -16,7 +16,7 @@ from cairn_map.evidence.cell_order import hottest_k
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.fingerprint import Fingerprint, fingerprint
 from cairn_map.evidence.grid import CellKey, Geometry, cell_of_key
-from cairn_server.folding.decoding_room import DECODING
+from cairn_server.cell_room import DECODING
 from cairn_server.store.stamps import CellStamps, Stamps, decode_cell_stamps, decode_stamps
 from cairn_server.store.store import Snapshot
 from cairn_server.store.store_rows import CellRow, Contribution
@@ -171,13 +171,14 @@ def _sound_stamps(stored: CellRow, decode: Callable[[bytes], T]) -> T:
         return decode(b"")
 
 
-def cell_to_change(snapshot: Snapshot, key: CellKey, geometry: Geometry) -> tuple[BrickCell, CellStamps]:
-    """A cell of the map, to be changed; a damaged one is rebuilt from the log.
+def cell_to_change(
+    snapshot: Snapshot, key: CellKey, stored: CellRow | None, geometry: Geometry
+) -> tuple[BrickCell, CellStamps]:
+    """Cell of a row of the map, to be changed; a damaged one is rebuilt from the log.
 
     Raises:
         DamagedCellError: it is damaged, and the log cannot rebuild it.
     """
-    stored = row_of_cell(snapshot, key)
     cell = BrickCell(geometry)
     if stored is None:
         return cell, CellStamps(geometry.depth)

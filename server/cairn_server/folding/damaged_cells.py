@@ -18,8 +18,8 @@ from cairn_map.evidence.cell_order import hottest_k
 from cairn_map.evidence.fingerprint import fingerprint
 from cairn_map.evidence.grid import CellKey, cell_of_key
 from cairn_map.wire.messages import DAMAGED_MAX
+from cairn_server.cell_room import DECODING
 from cairn_server.folding.cells_at_rest import sound_cell
-from cairn_server.folding.decoding_room import DECODING
 from cairn_server.store.store import Snapshot, Store
 from cairn_server.store.store_rows import CellRow, MapRow
 
@@ -63,7 +63,7 @@ def as_named(snapshot: Snapshot, keys: frozenset[CellKey]) -> Damaged:
     """Damaged cells for a reply's header, at most `DAMAGED_MAX`; fingerprints are stored apart from the bytes."""
     if not keys:
         return []
-    found = ((cell_of_key(cell.key), cell.fingerprint.hex()) for cell in snapshot.cells() if cell.key in keys)
+    found = ((cell_of_key(cell.key), cell.fingerprint.hex()) for cell in snapshot.cells_of(keys))
     return list(islice(found, DAMAGED_MAX))
 
 
@@ -126,4 +126,4 @@ def heal_cell(store: Store, row: MapRow, key: CellKey, data: bytes, *, by: str) 
 
 def _row_of(snapshot: Snapshot, key: CellKey) -> CellRow | None:
     """Row of a cell from the listing, without its bytes, which may be unreadable."""
-    return next((cell for cell in snapshot.cells() if cell.key == key), None)
+    return next(iter(snapshot.cells_of([key])), None)

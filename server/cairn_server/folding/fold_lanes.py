@@ -17,6 +17,7 @@ from cairn_map.evidence.grid import CellKey
 from cairn_server.folding.background_plan import BackgroundPlan
 from cairn_server.folding.cell_cache import CellCache
 from cairn_server.folding.commit_work import NAME_S, SLICE_S, SLICE_S_PER_BYTE, commit_work_s, part_of, slice_s
+from cairn_server.folding.fold_memory import FoldMemory
 from cairn_server.folding.fold_turns import FoldTurns
 from cairn_server.folding.folding import FoldStore
 from cairn_server.store.store_rows import MapRow, StoredCommit
@@ -40,9 +41,10 @@ class _Weight(NamedTuple):
 class FoldLanes:
     """The lanes of all maps of a store; one thread at a time."""
 
-    def __init__(self, store: FoldStore, *, cells_bytes: int) -> None:
-        """Plan with so much memory for the cells under change."""
+    def __init__(self, store: FoldStore, memory: FoldMemory, *, cells_bytes: int) -> None:
+        """Plan with this memory, of which the cells under change have so much."""
         self._store = store
+        self._memory = memory
         self._cells_bytes = cells_bytes
         self._plan: BackgroundPlan | None = None
         self._costly: dict[RobotName, list[StoredCommit]] = {}
@@ -146,7 +148,7 @@ class FoldLanes:
                 break
             chosen.append(commit)
         try:
-            self._plan = BackgroundPlan(self._store, row, chosen, cells_bytes=self._cells_bytes)
+            self._plan = BackgroundPlan(self._store, row, chosen, self._memory, cells_bytes=self._cells_bytes)
         except DamagedDataError:
             self._set_aside(chosen)
 

@@ -14,22 +14,21 @@ in its own thread until its next start.
 import logging
 import os
 import traceback
-from collections.abc import Iterable
-from contextlib import suppress
+from collections.abc import Callable, Collection, Iterable
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing.connection import Connection
-from pathlib import Path
 
+from cairn_map.commits.ids import CommitId
 from cairn_map.errors import CairnError
 from cairn_map.evidence.grid import CellKey
-from cairn_server.folding.cell_cache import CACHE_BYTES
-from cairn_server.folding.folding import Damage, FoldStore
+from cairn_server.folding.fold_memory import FoldMemory
+from cairn_server.folding.folding import Damage, FoldReads, FoldStore
 from cairn_server.folding.group_folding import Folded, LocalFolding
 from cairn_server.processes import fork
-from cairn_server.store.sqlite.readers import Readers
-from cairn_server.store.sqlite.reads import SqliteReads
-from cairn_server.store.store_rows import Fold, MapRow
+from cairn_server.store.store import Snapshot
+from cairn_server.store.store_rows import Fold, MapRow, StoredCommit
 
 log = logging.getLogger(__name__)
 
@@ -47,7 +46,6 @@ class _Ask:
     """Request to fold a group of this map; `healed` is `Damage.healed` of it."""
 
     row: MapRow
-    maps: int
     healed: int
     is_news: bool
 
@@ -102,7 +100,7 @@ class FoldProcess:
         """Number of the process; None: the other end is no process of its own."""
         self._link = link
 
-    def fold(self, row: MapRow, store: FoldStore, damaged: Damage, *, maps: int, is_news: bool = True) -> Folded:
+    def fold(self, row: MapRow, store: FoldStore, damaged: Damage, *, is_news: bool = True) -> Folded:
         """Fold one group as `LocalFolding.fold` does: planned in the process, written to the store here.
 
         Raises:
@@ -112,7 +110,7 @@ class FoldProcess:
         """
         failure: BaseException | None = None
         try:
-            self._link.send(_Ask(row, maps, damaged.healed(row.name), is_news))
+            self._link.send(_Ask(row, damaged.healed(row.name), is_news))
             # Until the process says how it ended, it may ask to write, and report damage and log lines.
             while True:
                 match self._link.recv():
@@ -148,23 +146,28 @@ class FoldProcess:
             os.waitpid(self.pid, 0)
 
 
-def fork_folding(store_file: Path, *, cells_bytes: int = CACHE_BYTES) -> FoldProcess:
-    """Fork a process that folds the store in this file, which may be made later; only before there are threads."""
-    link, pid = fork(partial(_be_folder, store_file=store_file, cells_bytes=cells_bytes))
+def fork_folding(reads_of: Callable[[], FoldReads], memory: FoldMemory | None = None) -> FoldProcess:
+    """Fork a process that folds; only before there are threads.
+
+    Args:
+        reads_of: called in the process, returns what reads the store, which need not be made before the first fold.
+        memory: for folding.
+    """
+    link, pid = fork(partial(_be_folder, reads_of=reads_of, memory=memory))
     return FoldProcess(link, pid=pid)
 
 
-def _be_folder(link: Connection, store_file: Path, cells_bytes: int) -> None:
+def _be_folder(link: Connection, reads_of: Callable[[], FoldReads], memory: FoldMemory | None) -> None:
     """Run the process's side until the server is gone."""
     # Its log lines go to the server: two processes would write over each other's.
     logging.basicConfig(handlers=[_FarLog(link)], force=True)
-    answer_folds(link, Readers(store_file), cells_bytes=cells_bytes)
+    answer_folds(link, reads_of(), memory)
 
 
-def answer_folds(link: Connection, readers: Readers, *, cells_bytes: int = CACHE_BYTES) -> None:
+def answer_folds(link: Connection, reads: FoldReads, memory: FoldMemory | None = None) -> None:
     """Plan the folds that the other end asks for, until it is gone."""
-    far = _FarStore(readers, link)
-    here = LocalFolding(far, far.damaged, cells_bytes=cells_bytes)
+    far = _FarStore(reads, link)
+    here = LocalFolding(far, far.damaged, memory)
     with suppress(EOFError, OSError):
         while True:
             ask: _Ask = link.recv()
@@ -174,7 +177,7 @@ def answer_folds(link: Connection, readers: Readers, *, cells_bytes: int = CACHE
 
 def _answer(here: LocalFolding, ask: _Ask) -> Folded | _Failed:
     try:
-        return here.fold(ask.row, maps=ask.maps, is_news=ask.is_news)
+        return here.fold(ask.row, is_news=ask.is_news)
     except _NotWrittenError:
         return _Failed(None)
     except CairnError as exc:
@@ -189,13 +192,27 @@ class _NotWrittenError(Exception):
     """The server could not write; its side keeps the reason."""
 
 
-class _FarStore(SqliteReads):
-    """`FoldStore` that reads the file itself and has the server write."""
+class _FarStore:
+    """`FoldStore` that reads the store itself and has the server write."""
 
-    def __init__(self, readers: Readers, link: Connection) -> None:
-        super().__init__(readers)
+    def __init__(self, reads: FoldReads, link: Connection) -> None:
+        self._reads = reads
         self._link = link
         self.damaged = _FarDamage(link)
+
+    def pending(
+        self, row: MapRow, *, limit: int, size_bytes_max: int, skip: Collection[int] = ()
+    ) -> list[StoredCommit]:
+        return self._reads.pending(row, limit=limit, size_bytes_max=size_bytes_max, skip=skip)
+
+    def folded(self, row: MapRow, commit: CommitId) -> StoredCommit | None:
+        return self._reads.folded(row, commit)
+
+    def is_retracted(self, row: MapRow, commit: CommitId) -> bool:
+        return self._reads.is_retracted(row, commit)
+
+    def snapshot(self, row: MapRow) -> AbstractContextManager[Snapshot]:
+        return self._reads.snapshot(row)
 
     def fold(self, row: MapRow, fold: Fold) -> bool:
         self._link.send(_Write(fold))

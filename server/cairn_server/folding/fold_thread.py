@@ -1,13 +1,15 @@
 """The thread that folds: it wakes up when a commit is accepted, and at start for what a crash left over."""
 
 import logging
+import secrets
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 
 from cairn_map.errors import CairnError
-from cairn_server.folding.cell_cache import CACHE_BYTES
 from cairn_server.folding.damaged_cells import DamagedCells
+from cairn_server.folding.fold_memory import FoldMemory
 from cairn_server.folding.fold_process import FoldProcess, LostProcessError
 from cairn_server.folding.group_folding import Folded, LocalFolding
 from cairn_server.folding.readiness import FoldHealth
@@ -20,6 +22,10 @@ REST_SHARE, REST_MAX_S = 3.0, 0.5
 """While robots push, each fold is followed by a rest of `REST_SHARE` times its length, at most `REST_MAX_S`. Commits
 that come in it are folded together, each cell encoded once: encoding 15 cells takes 30 ms, for one scan or for 200;
 merging a scan takes 1 ms."""
+POLL_S = 0.2
+"""Time between two looks for commits that came by another server of the same store."""
+CLAIM_MAX = 16
+"""Maps that are claimed at a time, so that processes that fold together share them by how fast they are."""
 LOOK_S = 0.02
 """Time between two looks at a plan in the background."""
 FORGET_MAX = 64
@@ -44,7 +50,7 @@ class FoldThread:
         on_fold: Callable[[MapRow], None],
         may_forget_s: Callable[[str], float],
         process: FoldProcess | None = None,
-        cells_bytes: int = CACHE_BYTES,
+        memory: FoldMemory | None = None,
     ) -> None:
         """Start the thread.
 
@@ -56,7 +62,7 @@ class FoldThread:
             on_fold: called after each group, with the map.
             may_forget_s: by a map's name, age of the store before which evidence may be dropped.
             process: plans the folds; without one, or once it has ended, this thread does.
-            cells_bytes: memory for the cells under change.
+            memory: of this thread's own folding.
         """
         self._store = store
         self._health = health
@@ -69,7 +75,8 @@ class FoldThread:
         self._wake = threading.Event()
         self._closing = threading.Event()
         self._process = process
-        self._local = LocalFolding(store, damaged, cells_bytes=cells_bytes)
+        self._local = LocalFolding(store, damaged, memory)
+        self._holder = secrets.token_hex(8)
         self._wake.set()
         self._thread = threading.Thread(target=self._run, name="cairn-fold", daemon=True)
         self._thread.start()
@@ -88,6 +95,9 @@ class FoldThread:
         self._wake.set()
         self._thread.join()
         self._local.close()
+        if self._store.leases is not None:
+            with suppress(CairnError):  # they end by themselves
+                self._store.leases.release(holder=self._holder)
         if self._process is not None:
             self._process.close()
             self._process = None
@@ -95,7 +105,8 @@ class FoldThread:
     def _run(self) -> None:
         retry_s = FIRST_RETRY_S
         while not self._closing.is_set():
-            self._wake.wait(FORGET_EVERY_S)
+            # Commits that came by another server of this store wake nothing here.
+            self._wake.wait(FORGET_EVERY_S if self._store.leases is None else POLL_S)
             self._wake.clear()
             # A failure is retried without a new commit, after a growing pause.
             if self._fold_all():
@@ -120,20 +131,21 @@ class FoldThread:
             if is_woken:
                 self._wake.clear()
             is_news = busy or is_woken
-            busy = planning = False
+            busy = False
             start_s = time.monotonic()
             self._watch_clocks(start_s)
             try:
-                maps = self._store.maps()
+                maps = self._maps_at_work(maps if planning else [])
             except Exception:
                 log.exception("cannot list the maps")
                 return False
+            planning = False
             # One group of each map in turn: a busy map does not hold up the others.
             for row in maps:
                 if row.name in failed or self._closing.is_set():
                     continue
                 try:
-                    folded = self._fold_group(row, len(maps), is_news=is_news)
+                    folded = self._fold_group(row, is_news=is_news)
                     busy |= folded.commits > 0
                     planning |= folded.is_planning
                 except Exception as exc:
@@ -144,7 +156,16 @@ class FoldThread:
                     self._health.failed(row.name, exc)
             if busy:
                 self._closing.wait(rest_s(time.monotonic() - start_s, is_pushed=self._wake.is_set()))
-        return not (failed or self._forget_old(maps))
+        return not (failed or self._forget_old())
+
+    def _maps_at_work(self, planned: list[MapRow]) -> list[MapRow]:
+        """Maps with commits to be folded, and those of which some are planned in the background."""
+        waiting = self._store.waiting_maps()
+        if self._store.leases is not None:
+            waiting = self._store.leases.claim(waiting, holder=self._holder, new_max=CLAIM_MAX)
+        self._health.waiting(row.name for row in waiting)
+        known = {row.number for row in waiting}
+        return waiting + [row for row in planned if row.number not in known]
 
     def _watch_clocks(self, now_s: float) -> None:
         """Keep the store's age, and report a jump of the wall clock, at most once in `FORGET_EVERY_S`."""
@@ -162,12 +183,14 @@ class FoldThread:
             )
         self._store.keep_age()
 
-    def _forget_old(self, maps: list[MapRow]) -> bool:
+    def _forget_old(self) -> bool:
         """Drop evidence that need not be kept any longer, at most once in `FORGET_EVERY_S`; True if that failed."""
         if time.monotonic() < self._forget_next_s or self._closing.is_set():
             return False
         try:
-            counts = [self._forget_group(row) for row in maps]
+            before_s = self._store.age.now_s() - self._keep_evidence_s
+            maps = self._store.maps_with_evidence(before_s=before_s)
+            counts = [self._forget_group(row, before_s) for row in maps]
         except Exception:
             # Whatever it is: dropping is not urgent, and this thread must live.
             log.exception("old evidence cannot be dropped")
@@ -178,14 +201,14 @@ class FoldThread:
             self._wake.set()  # there is more; folding goes first
         return False
 
-    def _forget_group(self, row: MapRow) -> int:
+    def _forget_group(self, row: MapRow, before_s: float) -> int:
         # No evidence is dropped that the upstream server lacks.
-        before_s = min(self._store.age.now_s() - self._keep_evidence_s, self._may_forget_s(row.name))
+        before_s = min(before_s, self._may_forget_s(row.name))
         return self._store.forget_evidence(row, before_s=before_s, limit=FORGET_MAX)
 
-    def _fold_group(self, row: MapRow, maps: int, *, is_news: bool) -> Folded:
+    def _fold_group(self, row: MapRow, *, is_news: bool) -> Folded:
         start_s = time.monotonic()
-        folded = self._folded(row, maps, is_news=is_news)
+        folded = self._folded(row, is_news=is_news)
         self._health.folded(row.name, folded.commits, time.monotonic() - start_s)
         if folded.waits_for is not None:
             self._health.failed(row.name, folded.waits_for)
@@ -196,15 +219,15 @@ class FoldThread:
             )
         return folded
 
-    def _folded(self, row: MapRow, maps: int, *, is_news: bool) -> Folded:
+    def _folded(self, row: MapRow, *, is_news: bool) -> Folded:
         if self._process is not None:
             try:
-                return self._process.fold(row, self._store, self._damaged, maps=maps, is_news=is_news)
+                return self._process.fold(row, self._store, self._damaged, is_news=is_news)
             except LostProcessError:
                 log.error("the process that folds was killed; folding in the server's own until the next start")
                 self._process.close()
                 self._process = None
-        return self._local.fold(row, maps=maps, is_news=is_news)
+        return self._local.fold(row, is_news=is_news)
 
 
 def rest_s(took_s: float, *, is_pushed: bool) -> float:

@@ -20,16 +20,16 @@ from cairn_map.commits.commit import commit_sha
 from cairn_map.commits.cursor import ENTRY_FOLD, ENTRY_UNFOLD, Cursor, next_chain
 from cairn_map.commits.ids import CommitId
 from cairn_map.errors import BadInputError, DamagedDataError
-from cairn_map.evidence.blocks import Blocks, blocks_of
+from cairn_map.evidence.blocks import Blocks
 from cairn_map.evidence.brick_cell import BrickCell
-from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey
-from cairn_server.folding.cell_cache import CellCache, Step
-from cairn_server.folding.cells_at_rest import cell_to_change, decode_stored
+from cairn_server.cell_room import voxels_of
+from cairn_server.folding.cell_cache import CellCache, Changed, Step
+from cairn_server.folding.cells_at_rest import cell_to_change, decode_stored, row_of_cell
 from cairn_server.folding.commit_work import part_of
 from cairn_server.store.stamps import CellStamps
 from cairn_server.store.store import Snapshot
-from cairn_server.store.store_rows import Entry, Fold, Head, MapRow, RetractStep, StoredCommit
+from cairn_server.store.store_rows import CellRow, Entry, Fold, MapRow, RetractStep, StoredCommit
 
 log = logging.getLogger(__name__)
 
@@ -39,8 +39,8 @@ GROUP_BYTES_MAX = 64 << 20
 """Most bytes of the commits folded at once; a single larger commit is folded alone."""
 
 
-class FoldStore(Protocol):
-    """Part of `store.Store` that folding needs: little enough to be served to another process."""
+class FoldReads(Protocol):
+    """Part of `store.Store` that planning a fold reads; each process has its own."""
 
     def pending(
         self, row: MapRow, *, limit: int, size_bytes_max: int, skip: Collection[int] = ()
@@ -59,6 +59,10 @@ class FoldStore(Protocol):
     def snapshot(self, row: MapRow) -> AbstractContextManager[Snapshot]:
         """`Store.snapshot`."""
         ...
+
+
+class FoldStore(FoldReads, Protocol):
+    """Part of `store.Store` that folding needs: little enough to be served to another process."""
 
     def fold(self, row: MapRow, fold: Fold) -> bool:
         """`Store.fold`."""
@@ -110,13 +114,14 @@ def fold_commits(
         return 0
     with store.snapshot(row) as snapshot:
         head = snapshot.head
-    # Another folding may have taken some of them since `pending`: its head is our base, so only the vector tells; of a
-    # retract under way `store.fold` finds out.
-    commits = [commit for commit in commits if commit.due_from is not None or commit.id not in head.vector]
+        folded = {each.id for each in snapshot.named([commit.id for commit in commits]) if each.is_folded}
+    # Another folding may have taken some of them since `pending`, and its head is our base; of a retract under way
+    # `store.fold` finds out.
+    commits = [commit for commit in commits if commit.due_from is not None or commit.id not in folded]
     if not commits:
         return 0
     # Plan in memory, and write all of it or nothing.
-    cache.begin(head.cursor)
+    cache.begin(head)
     written = False
     try:
         fold = plan_fold(store, row, head, order(commits), cache)
@@ -139,15 +144,14 @@ def audit_damaged(store: FoldStore, row: MapRow, fold: Fold) -> None:
         store.audit("damaged_commit", f"map {row.name}: commit number {number} is set aside: {why}")
 
 
-def plan_fold(store: FoldStore, row: MapRow, head: Head, commits: Iterable[StoredCommit], cache: CellCache) -> Fold:
+def plan_fold(store: FoldStore, row: MapRow, head: Cursor, commits: Iterable[StoredCommit], cache: CellCache) -> Fold:
     """Plan of folding these commits on top of `head`, the state of the cells in `cache`."""
-    plan = _Plan(store, row, cache, head.cursor)
+    plan = _Plan(store, row, cache, head)
     for commit in commits:
         plan.take(commit)
     return Fold(
-        base=head.cursor,
-        head=Cursor(head.cursor.log_id, head.cursor.seq + len(plan.entries), plan.chain),
-        vector=head.vector.with_commits(plan.folded),
+        base=head,
+        head=Cursor(head.log_id, head.seq + len(plan.entries), plan.chain),
         entries=tuple(plan.entries),
         cells=cache.rows(plan.last_change),
         retracted=tuple(plan.retracted),
@@ -161,7 +165,7 @@ class _Plan:
     """Log entries and changed cells of the commits taken so far, on top of `start`."""
 
     store: FoldStore
-    row: MapRow
+    map: MapRow
     cache: CellCache
     start: Cursor
     chain: bytes = b""
@@ -181,7 +185,7 @@ class _Plan:
             return
         if not commit.retracts:
             return
-        with self.store.snapshot(self.row) as snapshot:
+        with self.store.snapshot(self.map) as snapshot:
             part = part_of(commit, snapshot)
         # Once for ever: a second retract of the same target, in this group or in the store, changes nothing.
         for target in (each.id for each in part.named):
@@ -206,18 +210,18 @@ class _Plan:
 
     def _retract(self, target: CommitId) -> None:
         # A target that did not come yet is only noted; `take` finds it when it comes.
-        known = self.folded.get(target) or self.store.folded(self.row, target)
+        known = self.folded.get(target) or self.store.folded(self.map, target)
         try:
             # The evidence of a folded target may be gone, or damaged: then the map keeps it, and an audit line says so.
             if known is not None:
                 self._enter(ENTRY_UNFOLD, known)
         except DamagedCommitError as exc:
-            self.store.audit("retract_failed", f"map {self.row.name}: {target} stays in the map: {exc.message}")
+            self.store.audit("retract_failed", f"map {self.map.name}: {target} stays in the map: {exc.message}")
             return  # and is not noted as retracted, so that a later retract may succeed
         self.retracted[target] = None
 
     def _is_retracted(self, commit: CommitId) -> bool:
-        return commit in self.retracted or self.store.is_retracted(self.row, commit)
+        return commit in self.retracted or self.store.is_retracted(self.map, commit)
 
     def _enter(self, kind: bytes, commit: StoredCommit) -> None:
         # All of the commit's cells or none: a damaged one raises before there is an entry.
@@ -229,7 +233,7 @@ class _Plan:
         self.last_change.update(dict.fromkeys(commit.diff, seq))
         # Rule 2: also where evidence was taken out, so that a state frame tells robots of the zeros (rule 10).
         for key, changed in blocks.items():
-            self.cache.stamp(key, changed, seq, self._load)
+            self.cache.stamp(key, changed, seq, self)
 
     def _apply(self, kind: bytes, commit: StoredCommit) -> dict[CellKey, Blocks]:
         """Add or subtract a commit's diff, all of it or nothing; returns the blocks of each cell that it touches."""
@@ -244,28 +248,33 @@ class _Plan:
         digests: list[bytes] = []
         try:
             for key, body in commit.diff.items():
-                decoded = _decoded(commit, key, body)
-                self._change(key, decoded.evidence, step, commit)
-                done[key] = blocks_of(decoded.evidence)
-                digests.append(decoded.digest)
+                done[key], digest = self._change(key, body, step, commit)
+                digests.append(digest)
             if commit_sha(commit.text, digests) != commit.sha:
                 raise DamagedCommitError("damaged_store", f"commit {commit.id} at rest does not have its SHA-256")
         except DamagedCommitError:
             for key in done:
-                self.cache.change(key, _decoded(commit, key, commit.diff[key]).evidence, undo, self._load)
+                self._change(key, commit.diff[key], undo, commit)
             raise
         return done
 
-    def _change(self, key: CellKey, evidence: Evidence, step: Step, commit: StoredCommit) -> None:
+    def _change(self, key: CellKey, body: bytes, step: Step, commit: StoredCommit) -> Changed:
         try:
-            self.cache.change(key, evidence, step, self._load)
+            return self.cache.change(key, voxels_of(body), lambda: _decoded(commit, key, body), step, self)
         except BadInputError as exc:
             raise DamagedCommitError("damaged_store", f"commit {commit.id} at rest: {exc.message}") from exc
 
-    def _load(self, key: CellKey) -> tuple[BrickCell, CellStamps]:
-        # A snapshot of its own: if another folding wrote since `start`, `store.fold` refuses the whole plan.
-        with self.store.snapshot(self.row) as snapshot:
-            return cell_to_change(snapshot, key, self.row.geometry)
+    # As `StoredCells`, each with a snapshot of its own: if another folding wrote since `start`, `store.fold` refuses.
+
+    def row(self, key: CellKey) -> CellRow | None:
+        """Row of a cell."""
+        with self.store.snapshot(self.map) as snapshot:
+            return row_of_cell(snapshot, key)
+
+    def opened(self, key: CellKey, row: CellRow | None) -> tuple[BrickCell, CellStamps]:
+        """Cell of a row, to be changed."""
+        with self.store.snapshot(self.map) as snapshot:
+            return cell_to_change(snapshot, key, row, self.map.geometry)
 
 
 def _decoded(commit: StoredCommit, key: CellKey, body: bytes) -> DecodedCell:

@@ -16,10 +16,11 @@ from dataclasses import dataclass, field
 from cairn_map.commits.ids import RobotName
 from cairn_map.errors import CairnError
 from cairn_map.evidence.grid import CellKey, cell_of_key
-from cairn_server.folding.cell_cache import CACHE_BYTES, CellCache
-from cairn_server.folding.cells_at_rest import DamagedCellError, cell_to_change
+from cairn_server.folding.cell_cache import CellCache
+from cairn_server.folding.cells_at_rest import DamagedCellError, cell_to_change, row_of_cell
 from cairn_server.folding.commit_work import part_of
 from cairn_server.folding.fold_lanes import FoldLanes
+from cairn_server.folding.fold_memory import FoldMemory
 from cairn_server.folding.fold_turns import FoldTurns
 from cairn_server.folding.folding import GROUP_BYTES_MAX, Damage, FoldStore, Order, fold_commits
 from cairn_server.store.store_rows import MapRow, StoredCommit
@@ -142,7 +143,7 @@ def _touches(store: FoldStore, row: MapRow, commit: StoredCommit, cells: set[Cel
 def _can_be_read(store: FoldStore, row: MapRow, key: CellKey) -> bool:
     try:
         with store.snapshot(row) as snapshot:
-            cell_to_change(snapshot, key, row.geometry)
+            cell_to_change(snapshot, key, row_of_cell(snapshot, key), row.geometry)
     except DamagedCellError:
         return False
     return True
@@ -163,22 +164,22 @@ class Folded:
 class LocalFolding:
     """Folding in the calling thread, with the cells under change of all maps in memory; one thread at a time."""
 
-    def __init__(self, store: FoldStore, damaged: Damage, *, cells_bytes: int = CACHE_BYTES) -> None:
-        """Fold what waits in a store, with so much memory for the cells under change of all maps."""
-        self._cells_bytes = cells_bytes
+    def __init__(self, store: FoldStore, damaged: Damage, memory: FoldMemory | None = None) -> None:
+        """Fold what waits in a store, with this much memory."""
+        self._memory = memory or FoldMemory()
         self._store = store
         self._damaged = damaged
         self._caches: dict[str, CellCache] = {}
         self._waiting: dict[str, Waiting] = {}
         self._turns: dict[str, FoldTurns] = {}
-        self._lanes = FoldLanes(store, cells_bytes=int(PLAN_SHARE * cells_bytes))
+        self._lanes = FoldLanes(store, self._memory, cells_bytes=int(PLAN_SHARE * self._memory.cells_bytes))
 
     def close(self) -> None:
         """Wait for what is planned in the background."""
         self._lanes.close()
 
-    def fold(self, row: MapRow, *, maps: int, is_news: bool = True) -> Folded:
-        """Fold one group of a map's pending commits; `maps` maps share the memory for cells.
+    def fold(self, row: MapRow, *, is_news: bool = True) -> Folded:
+        """Fold one group of a map's pending commits.
 
         Without news, if nothing came since a fold that left all the rest to the background, that alone is looked at.
 
@@ -187,9 +188,7 @@ class LocalFolding:
         """
         if not is_news and self._lanes.is_planning():
             return Folded(0, self._waiting[row.name].why if row.name in self._waiting else None, is_planning=True)
-        # The cells stay decoded from one group to the next: a robot's next scans touch the same ones.
-        cache = self._caches.setdefault(row.name, CellCache(row.geometry))
-        cache.limit(int((1 - PLAN_SHARE) * self._cells_bytes) // maps)
+        cache = self._cache_of(row)
         waiting = self._waiting.setdefault(row.name, Waiting())
         turns, start_s = self._turns.setdefault(row.name, FoldTurns()), time.monotonic()
         count = self._lanes.write_plan(row, cache, turns)
@@ -202,3 +201,18 @@ class LocalFolding:
         cache.trim()
         self._lanes.plan_next(row, turns)
         return Folded(count, waiting.why, is_planning=self._lanes.has_plan())
+
+    def _cache_of(self, row: MapRow) -> CellCache:
+        """Cells of a map that stay decoded from one group to the next: a robot's next scans touch the same ones.
+
+        All maps share one memory. At least half of it is for the map that is folded now; those that were folded longest
+        ago give theirs up.
+        """
+        bound = int((1 - PLAN_SHARE) * self._memory.cells_bytes)
+        cache = self._caches.pop(row.name, None) or CellCache(row.geometry, self._memory)
+        others = sum(other.size_bytes for other in self._caches.values())
+        while others > bound // 2:
+            others -= self._caches.pop(next(iter(self._caches))).size_bytes
+        self._caches[row.name] = cache
+        cache.limit(bound - others)
+        return cache

@@ -6,7 +6,7 @@ would stop those, too. Damage is a figure to watch instead (`cairn_fold_failures
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 from cairn_map.errors import CairnError, DamagedDataError, UnreachableError
 from cairn_server.metrics import ServerFigures
@@ -32,6 +32,12 @@ class FoldHealth:
         if commits:
             self._figures.fold_seconds.labels(name).observe(seconds)
             self._figures.folded.labels(name).inc(commits)
+
+    def waiting(self, names: Iterable[str]) -> None:
+        """Note which maps have commits to be folded: folding of the others does not fail."""
+        known = set(names)
+        with self._lock:
+            self._failing = {name: error for name, error in self._failing.items() if name in known}
 
     def failed(self, name: str, error: BaseException) -> None:
         """Note that a map could not be folded."""

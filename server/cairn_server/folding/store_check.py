@@ -1,15 +1,19 @@
 """Check of a whole store, map by map: every finding is something that is not as it should be.
 
-    log       every chain follows from the one before, the head is the last, the vector names what was folded
+    log       every chain follows from the one before, the head is the last, stored vectors name what was folded
     commits   every diff that is kept decodes, and all of a commit together have its SHA-256
+    sums      totals and tiles are those of the cells
     cells     bytes, digest, fingerprint and size agree; and where every diff is kept, the cell is their sum
 
 Sums are compared by fingerprint, which adds as evidence does, so nothing is merged.
 """
 
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
+from itertools import groupby
+
+import numpy as np
 
 from cairn_map.codec.cell_code import DecodedCell
 from cairn_map.commits.commit import commit_sha
@@ -18,9 +22,11 @@ from cairn_map.commits.version_vector import EMPTY
 from cairn_map.errors import CairnError, DamagedDataError
 from cairn_map.evidence.fingerprint import ZERO, Fingerprint, fingerprint
 from cairn_map.evidence.grid import CellKey, cell_of_key
+from cairn_map.kernels.morton_kernels import UInts
 from cairn_server.folding.cells_at_rest import decode_stored, rebuilt_cell, stored_evidence
 from cairn_server.store.store import Snapshot, Store
 from cairn_server.store.store_rows import CellRow, ChainedEntry, MapRow, StoredCommit
+from cairn_server.store.tiles import corners_of, first_and_last_key, tile_of
 
 PAGE = 500
 PENDING_BYTES_MAX = 256 << 20
@@ -40,6 +46,8 @@ class Finding:
     """Cell that it is about; None: no single cell."""
     sound: CellRow | None = None
     """Same cell rebuilt from the log; None where the log cannot."""
+    is_sum: bool = False
+    """True if a sum or a vector is wrong that the store keeps besides cells and log, and can compute again."""
 
     def __str__(self) -> str:
         return f"{self.map}: {self.what}"
@@ -72,6 +80,10 @@ def check_map(store: Store, row: MapRow, report: Report) -> MapCheck:
             checked.findings += _of_cell(snapshot, row, key, known)
         checked.cells += 1
         report(checked.commits + checked.cells, total)
+    # Of damaged cells the rows may be wrong, so that the sums cannot be judged by them.
+    if not any(finding.cell for finding in checked.findings):
+        with store.snapshot(row) as snapshot:
+            checked.findings += _of_sums(snapshot, row)
     return checked
 
 
@@ -83,7 +95,7 @@ def _commits(store: Store, row: MapRow, checked: MapCheck) -> Iterator[StoredCom
     vector, seq = EMPTY, 0
     while page := _log_page(store, row, after_seq=seq):
         for entry in page:
-            if entry.seq > head.cursor.seq:  # folded while we read
+            if entry.seq > head.seq:  # folded while we read
                 continue
             if entry.seq != seq + 1:
                 checked.findings.append(Finding(row.name, f"log: entry {seq + 1} is not there"))
@@ -97,14 +109,41 @@ def _commits(store: Store, row: MapRow, checked: MapCheck) -> Iterator[StoredCom
                 commit = store.folded(row, entry.commit)
                 if commit is not None:
                     yield commit
-        if seq >= head.cursor.seq or page[-1].seq > head.cursor.seq:
+        with store.snapshot(row) as snapshot:
+            is_stated = snapshot.vector_at(seq) == vector
+        if not is_stated:
+            checked.findings.append(Finding(row.name, f"vector at {seq}: it does not name the commits", is_sum=True))
+        if seq >= head.seq or page[-1].seq > head.seq:
             break
-    if (seq, chain) != (head.cursor.seq, head.cursor.chain):
-        checked.findings.append(Finding(row.name, f"log: it ends at {seq}, the head is {head.cursor}"))
-    if vector != head.vector:
-        checked.findings.append(Finding(row.name, "log: the vector does not name what was folded"))
+    if (seq, chain) != (head.seq, head.chain):
+        checked.findings.append(Finding(row.name, f"log: it ends at {seq}, the head is {head}"))
     waiting = store.pending(row, limit=PAGE, size_bytes_max=PENDING_BYTES_MAX)
     yield from (commit for commit in waiting if commit.due_from is None)
+
+
+def _of_sums(snapshot: Snapshot, row: MapRow) -> Iterator[Finding]:
+    """Sums over cells that the store keeps and that are not those of its cells."""
+    cells = list(snapshot.cells())
+    known = [cell for cell in cells if cell.voxels]
+    totals, sizes = snapshot.totals(), sum(cell.size_bytes for cell in known)
+    corners = corners_of(_numbers({tile_of(cell.key) for cell in known}), lambda _: [cell.key for cell in known])
+    if (totals.cells, totals.size_bytes, totals.corner_cells) != (len(known), sizes, corners):
+        yield Finding(row.name, f"totals: {totals} are not those of its {len(known)} cells", is_sum=True)
+    if snapshot.fingerprint_sum() != sum((cell.fingerprint for cell in cells), ZERO):
+        yield Finding(row.name, "totals: the fingerprint is not the sum of its cells'", is_sum=True)
+    for tile, group in groupby(cells, key=lambda cell: tile_of(cell.key)):
+        rows = list(group)
+        first, last = first_and_last_key(tile)
+        box = cell_of_key(first), cell_of_key(last)
+        newest = max(cell.lm for cell in rows)
+        is_newest = list(snapshot.cells(after_seq=newest - 1, box=box)) != []
+        if snapshot.fingerprint_sum(box) != sum((cell.fingerprint for cell in rows), ZERO) or not is_newest:
+            name = cell_of_key(rows[0].key)
+            yield Finding(row.name, f"tile of cell {name}: it has not the sums of its cells", is_sum=True)
+
+
+def _numbers(numbers: Collection[int]) -> UInts:
+    return np.array(sorted(numbers), np.uint64)
 
 
 def _log_page(store: Store, row: MapRow, *, after_seq: int) -> list[ChainedEntry]:

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from fastapi import APIRouter, FastAPI, Request
+from fastapi import APIRouter, FastAPI, Request, Response
 from fastapi.responses import HTMLResponse
 from starlette.middleware import Middleware
 
@@ -16,7 +16,7 @@ from cairn_server.http.middleware.head_checks import DeniedHandshakes, PlainPath
 from cairn_server.http.middleware.request_trail import RequestTrail
 from cairn_server.http.middleware.token_first import TokenFirst
 from cairn_server.http.middleware.work_turns import Lanes, WorkTurns
-from cairn_server.http.openapi import DocumentedApp, docs_page
+from cairn_server.http.openapi import DocumentedApp
 from cairn_server.http.routes import branch as branch_routes
 from cairn_server.http.routes import cell as cell_routes
 from cairn_server.http.routes import console as console_routes
@@ -48,7 +48,13 @@ ROUTERS = (
 def docs(request: Request) -> HTMLResponse:
     """The routes for people."""
     headers = {"Content-Security-Policy": "default-src 'none'; style-src 'unsafe-inline'"}
-    return HTMLResponse(docs_page(request.app.openapi()), headers=headers)
+    return HTMLResponse(request.app.page_bytes, headers=headers)
+
+
+@router.get("/openapi.json", include_in_schema=False)
+def openapi(request: Request) -> Response:
+    """The routes for machines."""
+    return Response(request.app.document_bytes, media_type="application/json")
 
 
 def make_app(service: Service, *, long_bodies: LongBodies | None = None) -> FastAPI:
@@ -63,6 +69,7 @@ def make_app(service: Service, *, long_bodies: LongBodies | None = None) -> Fast
         version="1",
         description="See server/PROTOCOL.md.",
         docs_url=None,
+        openapi_url=None,
         redoc_url=None,
         redirect_slashes=False,
         middleware=list(_middleware(service, own_names, lanes, bodies, reading, places)),
@@ -73,7 +80,7 @@ def make_app(service: Service, *, long_bodies: LongBodies | None = None) -> Fast
     app.state.lanes, app.state.bodies, app.state.reading, app.state.places = lanes, bodies, reading, places
     app.state.long_bodies = long_bodies or LongBodies()
     app.state.console_files = console_routes.ConsoleFiles()
-    for part in ROUTERS:
+    for part in ROUTERS if settings.folding != "only" else (operations_routes.router,):
         app.include_router(part)
     return app
 

@@ -6,6 +6,7 @@ framework's own page loads its scripts from another host, which a robot in the f
 
 import json
 from collections.abc import Iterator
+from functools import cached_property
 from html import escape
 
 from fastapi import FastAPI
@@ -26,6 +27,16 @@ code,pre{font:.9em ui-monospace,monospace}pre{background:#f4f4f4;padding:.75rem;
 
 class DocumentedApp(FastAPI):
     """FastAPI application whose document names problems (RFC 9457) for errors."""
+
+    @cached_property
+    def document_bytes(self) -> bytes:
+        """The document as JSON; encoded once, since strangers ask for it, too."""
+        return json.dumps(self.openapi(), ensure_ascii=False, separators=(",", ":")).encode()
+
+    @cached_property
+    def page_bytes(self) -> bytes:
+        """The document as a page."""
+        return docs_page(self.openapi()).encode()
 
     def openapi(self) -> Json:
         """The document; made once."""

@@ -15,15 +15,17 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
+from functools import lru_cache
 
 from pydantic import ValidationError
 
 from cairn_map.errors import CairnError, UnreachableError
 from cairn_map.wire.live_events import CHAIN_DIGITS, Beat, EventPosition, Hello, LiveEvent, RobotHeard, RobotSign
 from cairn_map.wire.messages import RobotStatus
-from cairn_server.live.live_map import LiveChanges, LiveRobots
+from cairn_server.live.live_map import LiveChanges, LiveRobots, StoredSign
+from cairn_server.store.replica_notes import NotedReport
 from cairn_server.store.store import Store
-from cairn_server.store.store_rows import MapRow
+from cairn_server.store.store_rows import Branch, MapRow
 
 log = logging.getLogger(__name__)
 
@@ -34,6 +36,7 @@ LISTENERS_OF_TOKEN_MAX = 16
 
 class _LiveMap:
     def __init__(self, store: Store, row: MapRow) -> None:
+        self.row = row
         self.name = row.name
         self.changes = LiveChanges(store, row)
         self.robots = LiveRobots(lambda: _signs(store, row))
@@ -70,9 +73,34 @@ class Hub:
             log.warning("map %s: cannot tell listeners what was folded: %s", row.name, exc.message)
         self._wake(live)
 
+    def listened_maps(self) -> list[MapRow]:
+        """Maps that have listeners."""
+        with self._lock:
+            return [live.row for live in self._maps.values() if live.listeners]
+
     def robots(self, row: MapRow) -> LiveRobots:
-        """Robots of a map, with the last sign of each."""
+        """Robots of a map, with the last sign of each that this server knows of."""
         return self._live(row).robots
+
+    def present_robots(self, row: MapRow) -> LiveRobots:
+        """Robots of a map, with what other servers of the store heard of them up to some seconds ago."""
+        live = self._live(row)
+        if self._store.replicas is not None and live.robots.refresh():
+            self._wake(live)
+        return live.robots
+
+    def is_registered(self, row: MapRow, branch: str) -> bool:
+        """True if there is a robot of this name on a map, whichever server of the store it registered at."""
+        robots = self.robots(row)
+        own = robots.of(branch)
+        if self._store.replicas is None:
+            return own is not None
+        found = self._store.branch(row, branch)
+        if found is None:
+            self.robot_left(row, branch)
+        elif own is None:
+            self.robot_came(row, _sign(found))
+        return found is not None
 
     def robot_heard(self, row: MapRow, branch: str, **news: object) -> None:
         """Note that a robot pushed, fetched, or reported; one that is not registered does not count."""
@@ -121,6 +149,7 @@ class Hub:
         try:
             # After the listener is in: what is folded from now on is read by `folded`, if not here.
             live.changes.read()
+            self.present_robots(row)
             listener.start(after)
         except BaseException:
             listener.leave()
@@ -192,8 +221,12 @@ class Listener:
         tick, self._heard, robots = self.live.robots.present()
         resumed = after is not None and self.live.changes.has_proof(after)
         seq, chain = head.seq, head.chain.hex()[:CHAIN_DIGITS]
-        if after is not None and resumed and after.seq <= head.seq:
-            seq, chain = after.seq, after.chain
+        if after is not None and resumed:
+            # Another server of this store, whose clock was ahead, may have given the last id: ids never fall. Of robots
+            # nothing is lost by it, since the first event has all of them.
+            tick = max(tick, after.tick)
+            if after.seq <= head.seq:
+                seq, chain = after.seq, after.chain
         self._seen = EventPosition(seq, chain, tick)
         self._hello = Hello(
             id=str(self._seen),
@@ -227,20 +260,25 @@ class Listener:
         self._hub.remove(self)
 
 
-def _signs(store: Store, row: MapRow) -> list[RobotSign]:
-    statuses = store.notes.statuses(row)
-    return [
-        RobotSign(
-            branch=branch.name,
-            mode=branch.mode,
-            time_s=branch.last_seen_s,
-            cursor=str(branch.cursor) if branch.cursor else None,
-            status=_status(statuses.get(branch.name)),
-        )
-        for branch in store.branches(row)
-    ]
+def _signs(store: Store, row: MapRow) -> list[StoredSign]:
+    if store.replicas is not None:
+        noted = store.replicas.reports.all(row)
+    else:
+        noted = {name: NotedReport(status) for name, status in store.notes.statuses(row).items()}
+    found = []
+    for branch in store.branches(row):
+        report = noted.get(branch.name, NotedReport())
+        sign = _sign(branch).model_copy(update={"status": _status(report.status), "view_s": report.view_s})
+        found.append(StoredSign(sign, report.status_s))
+    return found
 
 
+def _sign(branch: Branch) -> RobotSign:
+    cursor = str(branch.cursor) if branch.cursor else None
+    return RobotSign(branch=branch.name, mode=branch.mode, time_s=branch.last_seen_s, cursor=cursor)
+
+
+@lru_cache(maxsize=4096)  # of a crowd few report within the second in which all are read again
 def _status(text: str | None) -> RobotStatus | None:
     """Stored status; None if there is none, or it is of another version."""
     try:

@@ -7,6 +7,7 @@ import threading
 import time
 from collections import OrderedDict, deque
 from collections.abc import Callable
+from typing import NamedTuple
 
 from cairn_map.commits.cursor import Cursor
 from cairn_map.evidence.grid import CellKey, cell_of_key
@@ -37,6 +38,8 @@ SIGNS_MAX = 1000
 PAST_ENTRIES = 1000
 """Most log entries that a returning listener gets in single changes; after more it gets `many`."""
 CELLS_KEPT = 1024
+SAME_S = 1.0
+"""Age by which a sign in the store is newer than the one heard here before it counts as another one."""
 
 
 class LiveChanges:
@@ -73,7 +76,7 @@ class LiveChanges:
     def read(self) -> None:
         """Read what was folded since the last call."""
         with self._lock, self._store.snapshot(self._row) as snapshot:
-            head = snapshot.head.cursor
+            head = snapshot.head
             if self._head is not None and not is_proven(self._head, snapshot):
                 self._head = None
                 self._losses += 1
@@ -99,7 +102,7 @@ class LiveChanges:
     def has_proof(self, seen: EventPosition) -> bool:
         """True if a listener's place is one of this log: not another server's, and not lost in a restore."""
         with self._store.snapshot(self._row) as snapshot:
-            chain = snapshot.chain_at(seen.seq) if seen.seq <= snapshot.head.cursor.seq else None
+            chain = snapshot.chain_at(seen.seq) if seen.seq <= snapshot.head.seq else None
         return chain is not None and chain.hex()[:CHAIN_DIGITS] == seen.chain
 
     def since(self, seen: EventPosition, *, losses: int) -> tuple[list[LiveEvent], EventPosition]:
@@ -124,15 +127,52 @@ class LiveChanges:
         return [*events, HeadMoved(id=str(moved), cursor=str(head))], moved
 
 
+def _is_news(sign: RobotSign, known: RobotSign) -> bool:
+    """True unless a sign says what is known, of another time by what it takes to write it."""
+    return sign.time_s - known.time_s >= SAME_S or sign.model_copy(update={"time_s": known.time_s}) != known
+
+
+class StoredSign(NamedTuple):
+    """Sign of a robot as the store has it."""
+
+    sign: RobotSign
+    status_s: float = 0.0
+    """Time at which a server heard the status, where several write it."""
+
+
 class LiveRobots:
     """Last sign of each robot of one map, in the order of hearing; thread-safe."""
 
-    def __init__(self, load: Callable[[], list[RobotSign]]) -> None:
-        """`load` reads the store's signs, when they are first needed."""
+    def __init__(self, load: Callable[[], list[StoredSign]]) -> None:
+        """`load` reads the store's signs, when they are first needed, and at each `refresh`."""
         self._load = load
         self._lock = threading.Lock()
         self._signs: Signs | None = None
+        self._status_s: dict[str, float] = {}
+        """Times at which the statuses in the signs were heard, by branch."""
         self._tick = 0
+
+    def refresh(self) -> bool:
+        """Read the signs that other servers of the store wrote; True if there is news."""
+        with self._lock:
+            self._loaded()
+            begun = self._tick
+        stored = {each.sign.branch: each for each in self._load()}
+        with self._lock:
+            signs, before = self._loaded(), self._tick
+            for branch, (tick, sign) in list(signs.items()):
+                # What was heard here since the reading began may be newer than what was read.
+                if tick > begun:
+                    stored.pop(branch, None)
+                elif branch not in stored and not sign.gone:
+                    self._leave(sign)
+            for branch, each in stored.items():
+                own = self._there(signs, branch)
+                merged = each.sign if own is None else self._merged(own, each)
+                if own is None or _is_news(merged, own):
+                    self._status_s[branch] = max(each.status_s, self._status_s.get(branch, 0.0))
+                    self._hear(merged)
+            return self._tick > before
 
     def present(self) -> tuple[int, int, list[RobotSign]]:
         """Newest tick, and all registered robots by name, heard up to a tick: the newest one, too.
@@ -172,19 +212,43 @@ class LiveRobots:
             sign = self._there(self._signs, branch)
             if sign is None:
                 return False
-            self._hear(sign.model_copy(update={"time_s": time.time(), **news}))
+            now_s = time.time()
+            if "status" in news:
+                self._status_s[branch] = now_s
+            self._hear(sign.model_copy(update={"time_s": now_s, **news}))
             return True
 
     def left(self, branch: str) -> None:
         """Note that a robot was deregistered."""
         with self._lock:
             sign = self._there(self._signs, branch)
-            if self._signs is None or sign is None:
-                return
-            self._hear(RobotSign(branch=branch, mode=sign.mode, time_s=time.time(), gone=True))
-            gone = [name for name, (_, known) in self._signs.items() if known.gone]
-            for name in gone[: max(0, len(gone) - GONE_MAX)]:
-                del self._signs[name]
+            if sign is not None:
+                self._leave(sign)
+
+    def _leave(self, sign: RobotSign) -> None:
+        assert self._signs is not None  # noqa: S101 - by its callers
+        self._status_s.pop(sign.branch, None)
+        self._hear(RobotSign(branch=sign.branch, mode=sign.mode, time_s=time.time(), gone=True))
+        gone = [name for name, (_, known) in self._signs.items() if known.gone]
+        for name in gone[: max(0, len(gone) - GONE_MAX)]:
+            del self._signs[name]
+
+    def _merged(self, own: RobotSign, stored: StoredSign) -> RobotSign:
+        """Sign of what was heard here and what others wrote, each part as it was heard last.
+
+        A first status or picture is written at once: what the store lacks went with a registration that ended.
+        """
+        other = stored.sign
+        is_later = other.time_s > own.time_s
+        has_status = other.status is not None and stored.status_s <= self._status_s.get(own.branch, 0.0)
+        return other.model_copy(
+            update={
+                "time_s": max(own.time_s, other.time_s),
+                "cursor": (other.cursor if is_later else None) or own.cursor,
+                "status": own.status if has_status else other.status,
+                "view_s": None if other.view_s is None else max(other.view_s, own.view_s or 0.0),
+            }
+        )
 
     def _there(self, signs: Signs | None, branch: str) -> RobotSign | None:
         _, sign = signs.get(branch, (0, None)) if signs else (0, None)
@@ -193,7 +257,8 @@ class LiveRobots:
     def _loaded(self) -> Signs:
         if self._signs is None:
             self._signs = OrderedDict()
-            for sign in sorted(self._load(), key=lambda sign: sign.time_s):
+            for sign, status_s in sorted(self._load(), key=lambda stored: stored.sign.time_s):
+                self._status_s[sign.branch] = status_s
                 self._hear(sign)
         return self._signs
 

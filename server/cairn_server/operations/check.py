@@ -10,6 +10,10 @@ the server does. The exit code is 0 if all is sound and 6 if not.
     $ cairn serve check --data ./cairn-data --repair
     lab: cell 0,-1,2 at rest does not have its digest: rebuilt from its commits
 
+    $ cairn serve check --store postgresql://cairn@database/cairn
+
+A database is checked in the same way, while servers work on it; its own pages are its own server's (pg_amcheck).
+
 With --repair, which needs the server stopped, damaged cells are rebuilt where the log still has all of their commits.
 Others stay set aside: the server answers 500 damaged_store for such a cell alone and goes on with all others; commits
 that touch it wait. The next robot that syncs and still has the cell as it was heals it by itself; or a backup from
@@ -22,9 +26,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from cairn_map.errors import EXIT_CODES, DamagedDataError
+from pydantic import ValidationError
+
+from cairn_map.errors import EXIT_CODES, BadInputError, DamagedDataError, first_error
 from cairn_map.progress import PercentLine
 from cairn_server.folding.store_check import Finding, check_map
+from cairn_server.operations.store_opening import store_of
 from cairn_server.settings import Settings
 from cairn_server.store.sqlite.archive import SqliteArchive
 from cairn_server.store.sqlite.store import FILE_NAME, SqliteStore
@@ -38,12 +45,17 @@ def main(argv: list[str]) -> int:
         "cairn serve check", description=__doc__, epilog=EXIT_CODES, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("--data", type=Path, default=Settings().folder, metavar="DIR", help="folder of the store")
+    parser.add_argument("--store", metavar="URL", help="check this PostgreSQL database instead of a folder")
     parser.add_argument("--repair", action="store_true", help="rebuild damaged cells; the server must be stopped")
     args = parser.parse_args(argv)
+    if args.store is not None:
+        return _check_database(args.store, is_repair=args.repair)
     if args.repair:
         store = SqliteStore(args.data)
         try:
             outcome = check_all(store, _complaints(args.data))
+            if any(finding.is_sum for _, finding in outcome.findings):
+                store.recount()
             left = [text for row, finding in outcome.findings for text in _healed(store, row, finding)]
         finally:
             store.close()
@@ -60,6 +72,32 @@ def main(argv: list[str]) -> int:
         sys.stdout.writelines(f"{text}\n" for text in left)
     if left:
         raise DamagedDataError("damaged_store", f"{outcome.summary}: {len(left)} things are damaged")
+    sys.stdout.write(f"{outcome.summary}: all sound\n")
+    return 0
+
+
+def _check_database(url: str, *, is_repair: bool) -> int:
+    if is_repair:
+        raise BadInputError(
+            "bad_setting",
+            "--repair is for a folder; cells of a database are rebuilt by the server that meets them, or healed by "
+            "the next robot that has them, and sums come with a restored backup",
+        )
+    try:
+        open_store, _ = store_of(Settings(store=url))
+    except ValidationError as exc:
+        raise BadInputError("bad_setting", f"--store: {first_error(exc)}") from exc
+    store = open_store()
+    try:
+        return _reported(check_all(store))
+    finally:
+        store.close()
+
+
+def _reported(outcome: "Outcome") -> int:
+    sys.stdout.writelines(f"{finding}\n" for _, finding in outcome.findings)
+    if outcome.findings:
+        raise DamagedDataError("damaged_store", f"{outcome.summary}: {len(outcome.findings)} things are damaged")
     sys.stdout.write(f"{outcome.summary}: all sound\n")
     return 0
 
@@ -102,6 +140,9 @@ def _healed(store: SqliteStore, row: MapRow | None, finding: Finding) -> list[st
     if row is not None and finding.sound is not None and store.health.heal(row, finding.sound):
         store.audit("healed_cell", f"map {row.name}: {finding.what}: rebuilt from its commits")
         sys.stdout.write(f"{finding}: rebuilt from its commits\n")
+        return []
+    if finding.is_sum:
+        sys.stdout.write(f"{finding}: computed again\n")
         return []
     sys.stdout.write(f"{finding}\n")
     return [str(finding)]

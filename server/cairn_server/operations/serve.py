@@ -41,7 +41,7 @@ import signal
 import socket
 import sys
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import AbstractContextManager, closing, nullcontext
 from types import FrameType
 from typing import Any
 
@@ -50,7 +50,7 @@ from fastapi import FastAPI
 
 from cairn_map.errors import BadInputError
 from cairn_server.access.turns import Turns
-from cairn_server.folding.cell_cache import CACHE_BYTES
+from cairn_server.folding.fold_memory import FoldMemory
 from cairn_server.folding.fold_process import fork_folding
 from cairn_server.http.app import make_app
 from cairn_server.http.middleware.deadlines import ListenerProtocol, protocol_of
@@ -61,11 +61,11 @@ from cairn_server.http.routes.long_bodies import LongBodies, fork_long_bodies
 from cairn_server.operations import check as check_command
 from cairn_server.operations.backup import back_up_command, restore_command
 from cairn_server.operations.serve_options import serve_parser, settings_of
+from cairn_server.operations.store_opening import store_of
 from cairn_server.operations.upstream import joined
 from cairn_server.service import Service
 from cairn_server.settings import LOOPBACK, Settings
-from cairn_server.store.folder_lock import tell_port
-from cairn_server.store.sqlite.store import FILE_NAME, SqliteStore
+from cairn_server.store.folder_lock import lock_folder, tell_port
 from cairn_server.views.view_prefetch import ViewPrefetch
 
 log = logging.getLogger(__name__)
@@ -103,16 +103,20 @@ def main(argv: list[str]) -> int:
     settings = settings_of(args)
     settings.check_reach()
     settings.check_tls()
+    settings.check_folding()
     settings = settings.model_copy(update={"limit_concurrency": connections_within(settings.limit_concurrency)})
     signal.signal(signal.SIGTERM, _stop)
     sys.setswitchinterval(SWITCH_S)
     # Forked before there are threads: a lock that another thread held at the fork would stay locked in the child.
-    folding = fork_folding(settings.folder / FILE_NAME, cells_bytes=int(settings.memory.cache_share * CACHE_BYTES))
+    open_store, reads_of = store_of(settings)
+    folding = None
+    if settings.folding == "here":
+        folding = fork_folding(reads_of, FoldMemory.of_server(settings.memory, settings.folder))
     long_bodies = fork_long_bodies()
     keep_memory_small()
-    with listen(settings.host, settings.port) as listener:
+    with _folder_of(settings), listen(settings.host, settings.port) as listener:
         try:
-            service = Service(SqliteStore(settings.folder), settings, fold_process=folding)
+            service = Service(open_store(), settings, fold_process=folding)
             with closing(service), closing(ViewPrefetch(service.store, service.views.cells.cache)), joined(service):
                 _serve(service, listener, long_bodies)
         except KeyboardInterrupt:
@@ -120,6 +124,22 @@ def main(argv: list[str]) -> int:
         finally:
             long_bodies.close()
     return 0
+
+
+def _folder_of(settings: Settings) -> AbstractContextManager[object]:
+    """The folder of files on their way, which no other server has; SQLite's store takes it itself.
+
+    Raises:
+        ConflictError: kind `store_in_use`.
+        BadInputError: kind `bad_store`: it cannot be made.
+    """
+    if settings.store is None:
+        return nullcontext()
+    try:
+        settings.folder.mkdir(0o700, parents=True, exist_ok=True)
+        return lock_folder(settings.folder)
+    except OSError as exc:
+        raise BadInputError("bad_store", f"cannot keep files in {settings.folder}: {exc.strerror}") from exc
 
 
 def _serve(service: Service, listener: socket.socket, long_bodies: LongBodies) -> None:
@@ -131,7 +151,7 @@ def _serve(service: Service, listener: socket.socket, long_bodies: LongBodies) -
     if scheme == "http" and host not in LOOPBACK:
         log.warning("tokens and maps travel in the clear: give --tls-cert and --tls-key, or put a TLS proxy before it")
     tell_port(service.settings.folder, port)
-    sys.stdout.write(f"cairn map server on {scheme}://{shown}:{port}, data in {service.settings.folder}\n")
+    sys.stdout.write(f"cairn map server on {scheme}://{shown}:{port}, data in {service.settings.place}\n")
     sys.stdout.write(f"{service.settings.memory.text()}\n")
     sys.stdout.flush()
     # A full sweep of the garbage collector takes 0.1 to 0.3 s, in which all wait. What is there by now stays, so none

@@ -39,6 +39,7 @@ FILE_BYTES_MAX = MEGABYTE
 WIDTH = 110
 FLAGS = {
     "folder": ("--data", "DIR"),
+    "store": ("--store", "URL"),
     "host": ("--host", "ADDRESS"),
     "port": ("--port", "PORT"),
     "tls_cert": ("--tls-cert", "FILE"),
@@ -55,7 +56,12 @@ SECRETS = {
     "upstream_token": "--upstream-token-file",
 }
 """Flag of each secret: the file that holds it, since other users see a process's arguments."""
-OTHER_FLAGS = {"metrics_open": "--metrics-open", "trusted_servers": "--trust-server", "public_urls": "--public-url"}
+OTHER_FLAGS = {
+    "metrics_open": "--metrics-open",
+    "folding": "--no-fold",
+    "trusted_servers": "--trust-server",
+    "public_urls": "--public-url",
+}
 REPEATED = frozenset({"trusted_servers", "public_urls"})
 """Settings whose flags may be repeated; their values are separated by spaces."""
 MOVED = {
@@ -104,6 +110,11 @@ def serve_parser(description: str | None) -> argparse.ArgumentParser:
         help="URL under which robots ask this server, where its own address or certificate does not say it (behind a "
         "proxy, by a name of DNS): robots prove their keys to these names only; may be repeated",
     )
+    for flag, folding, text in (
+        ("--no-fold", "elsewhere", "leave it to other servers of the same --store to bring what came into the maps"),
+        ("--fold-only", "only", "do nothing but that for other servers of the same --store; answer probes and metrics"),
+    ):
+        parser.add_argument(flag, dest="folding", action="store_const", const=folding, help=text)
     parser.add_argument("--metrics-open", action="store_true", help=_help(Settings, "metrics_open"))
     forms = [str(form) for form in LogForm]
     parser.add_argument("--log-format", choices=forms, default=forms[0], help=f"form of log lines ({forms[0]})")

@@ -14,23 +14,24 @@ from typing import Protocol
 from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.ids import Author, CommitId, Incarnation
 from cairn_map.commits.version_vector import VersionVector
+from cairn_map.errors import ConflictError
+from cairn_map.evidence.fingerprint import Fingerprint
 from cairn_map.evidence.grid import CellKey, Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.wire.access_messages import AuditEntry
 from cairn_map.wire.messages import LogEntry
 from cairn_server.store.admission import OWN_WORD, Grounds, RobotKey
+from cairn_server.store.replica_notes import ReplicaNotes
 from cairn_server.store.store_age import StoreAge
 from cairn_server.store.store_rows import (
     Backlog,
     Branch,
     CellRow,
-    CellState,
     ChainedEntry,
     ClosedRobot,
     Contribution,
     EntrySize,
     Fold,
-    Head,
     MapRow,
     NamedCommit,
     NewCommit,
@@ -43,13 +44,14 @@ from cairn_server.store.store_rows import (
     Totals,
     Use,
 )
+from cairn_server.store.tiles import Box
 
 
 class Snapshot(Protocol):
     """One state of one map, for reading; close it before anything is written to a network."""
 
     @property
-    def head(self) -> Head:
+    def head(self) -> Cursor:
         """The state."""
         ...
 
@@ -61,8 +63,21 @@ class Snapshot(Protocol):
         """One cell with its body."""
         ...
 
-    def cells(self, *, after_seq: int = -1, after_key: int = -1, limit: int | None = None) -> Iterator[CellRow]:
-        """Cells changed after a log entry, of numbers above `after_key`, at most `limit`; without bodies, rising."""
+    def cells(
+        self, *, after_seq: int = -1, after_key: int = -1, limit: int | None = None, box: Box | None = None
+    ) -> Iterator[CellRow]:
+        """Cells changed after a log entry, in a box, of numbers above `after_key`, at most `limit`.
+
+        Without bodies, rising. Reads the tiles that changed since, and their cells.
+        """
+        ...
+
+    def cells_of(self, keys: Collection[CellKey]) -> list[CellRow]:
+        """Those of these cells that are stored, without their bodies, by rising number."""
+        ...
+
+    def fingerprint_sum(self, box: Box | None = None) -> Fingerprint:
+        """Sum of the fingerprints of all cells, or of those in a box; reads tiles, and cells at the box's border."""
         ...
 
     def contributions(self, key: CellKey, *, after_seq: int, newest: int | None = None) -> list[Contribution]:
@@ -70,10 +85,6 @@ class Snapshot(Protocol):
 
         Those up to the cell's `gone_seq` may be missing.
         """
-        ...
-
-    def cell_states(self, keys: Collection[CellKey]) -> list[CellState]:
-        """Those of these cells that are stored, without their bodies, by rising number."""
         ...
 
     def named(self, commits: Sequence[CommitId]) -> list[NamedCommit]:
@@ -107,8 +118,12 @@ class Snapshot(Protocol):
         """Commits that are durable but not folded, without those that are set aside as damaged."""
         ...
 
-    def folded_before(self, age_s: float) -> VersionVector:
-        """Commits folded before an age of the store."""
+    def vector_at(self, seq: int) -> VersionVector:
+        """Ids of the commits folded at or before a log entry, at most the head's."""
+        ...
+
+    def seq_before(self, age_s: float) -> int:
+        """Newest log entry with a commit that was folded before an age of the store; 0: there is none."""
         ...
 
     def log(self, *, after_seq: int, limit: int, names_max: int | None = None) -> list[LogEntry]:
@@ -120,8 +135,33 @@ class Snapshot(Protocol):
         ...
 
     def totals(self) -> Totals:
-        """Sizes."""
+        """Sizes, without reading through cells or commits."""
         ...
+
+
+class FoldLeases(Protocol):
+    """Claims of maps by processes that fold one store together.
+
+    They save work and decide nothing: a fold is written only onto the state that it was made from.
+    """
+
+    def claim(self, maps: Sequence[MapRow], *, holder: str, new_max: int) -> list[MapRow]:
+        """Claim maps for `LEASE_S` from now on: those that are claimed by this holder, and some that no other one has.
+
+        Args:
+            maps: wanted, in the order in which they are given.
+            holder: name of the process, unlike all others.
+            new_max: most maps that are claimed and were not before.
+        """
+        ...
+
+    def release(self, *, holder: str) -> None:
+        """End all claims of a holder."""
+        ...
+
+
+LEASE_S = 5.0
+"""Seconds for which a claim of a map lasts: a process that was killed holds its maps up so long."""
 
 
 class BranchNotes(Protocol):
@@ -280,6 +320,24 @@ class AuditLog(Protocol):
         ...
 
 
+def check_same_map(name: str, known: tuple[Geometry, SensorModel], asked: tuple[Geometry, SensorModel]) -> None:
+    """Refuse to make a map of a name that another one has.
+
+    Raises:
+        ConflictError: kind `map_exists`.
+    """
+    if known[0] != asked[0]:
+        raise ConflictError(
+            "map_exists",
+            f"map {name} exists with {known[0]}; asked for were {asked[0]}. Use it as it is, or take another name",
+        )
+    if known[1] != asked[1]:
+        raise ConflictError(
+            "map_exists",
+            f"map {name} exists with {known[1]!r}; asked for was {asked[1]!r}. Use it as it is, or take another name",
+        )
+
+
 class Store(Protocol):
     """Store of maps; every method may be called from any thread."""
 
@@ -319,8 +377,18 @@ class Store(Protocol):
         ...
 
     @property
+    def leases(self) -> FoldLeases | None:
+        """Claims of maps, if several processes may fold this store; None: one process has it."""
+        ...
+
+    @property
     def notes(self) -> BranchNotes:
         """Notes on branches."""
+        ...
+
+    @property
+    def replicas(self) -> ReplicaNotes | None:
+        """Notes that several servers of this store share; None: one process has it, and keeps such things itself."""
         ...
 
     def create_map(self, name: str, geometry: Geometry, sensor_model: SensorModel) -> tuple[MapRow, bool]:
@@ -341,6 +409,18 @@ class Store(Protocol):
 
     def maps(self) -> list[MapRow]:
         """All maps, by name."""
+        ...
+
+    def heads(self, maps: Collection[MapRow] | None = None) -> list[tuple[MapRow, Cursor]]:
+        """All maps, or those of these that there are, with their present states, by name; in one query."""
+        ...
+
+    def waiting_maps(self) -> list[MapRow]:
+        """Maps with commits to be folded, or with a retract under way, by name; an idle map costs nothing."""
+        ...
+
+    def maps_with_evidence(self, *, before_s: float) -> list[MapRow]:
+        """Maps with evidence of commits folded before an age of the store, by name; in one query."""
         ...
 
     def append(self, row: MapRow, commit: NewCommit) -> bool:
@@ -425,6 +505,10 @@ class Store(Protocol):
 
     def branches(self, row: MapRow) -> list[Branch]:
         """All branches, by name."""
+        ...
+
+    def branch(self, row: MapRow, name: str) -> Branch | None:
+        """One branch as it is stored: signs of the last seconds may be missing."""
         ...
 
     def keep_age(self) -> None:

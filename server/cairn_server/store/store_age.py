@@ -54,6 +54,11 @@ class StoreAge:
         """Age now, seconds; it never falls."""
         return self._clocks.steady_s() - self._start_s
 
+    def follow(self, age_s: float) -> None:
+        """Go on from an age that another server of the store came to, if that is later."""
+        with self._lock:
+            self._start_s = min(self._start_s, self._clocks.steady_s() - age_s)
+
     def mark(self) -> AgeMark:
         """Age and time of day now, to be kept."""
         return AgeMark(self.now_s(), self._clocks.wall_s())

@@ -1,13 +1,13 @@
 """Rows of a store: maps, commits, cells, log entries, branches, tokens, and the sums over them."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.ids import Author, CommitId
-from cairn_map.commits.version_vector import EMPTY, VersionVector
+from cairn_map.commits.version_vector import VersionVector
 from cairn_map.evidence.fingerprint import Fingerprint
 from cairn_map.evidence.grid import CellKey, Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
@@ -92,14 +92,6 @@ class NamedCommit(NamedTuple):
     """Count of the bricks that it touches; one for each byte where that was not counted yet."""
 
 
-class CellState(NamedTuple):
-    """State of a stored cell, without its body."""
-
-    key: CellKey
-    lm: int
-    digest: bytes
-
-
 @dataclass(frozen=True, slots=True)
 class Contribution:
     """Effect of one log entry on one cell."""
@@ -164,9 +156,8 @@ class Fold:
 
     base: Cursor
     head: Cursor
-    vector: VersionVector
     entries: tuple[Entry, ...]
-    cells: tuple[CellRow, ...]
+    cells: Iterable[CellRow]
     retracted: tuple[CommitId, ...] = ()
     """Ids whose retract took or will take effect; each once, for ever."""
     damaged: tuple[tuple[int, str], ...] = ()
@@ -213,10 +204,10 @@ class Totals:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Head:
-    """The newest folded state."""
+    """State of a map that an answer was read from, and the commits in it."""
 
     cursor: Cursor
-    vector: VersionVector = field(default=EMPTY)
+    vector: VersionVector
 
 
 class ChainedEntry(NamedTuple):
@@ -304,8 +295,8 @@ class StoreFigures:
     """Bytes of the store's file, without the write-ahead log."""
     ahead_bytes: int
     """Bytes of the write-ahead log."""
-    free_bytes: int
-    """Free bytes of the disk."""
+    free_bytes: int | None
+    """Free bytes of the disk; None: it is a database's, which does not say."""
     queued: int
     """Jobs that wait for the writer."""
     written: int

@@ -12,13 +12,13 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
-from cairn_map.commits.ids import SERVERS_OWN, Author, Incarnation
+from cairn_map.commits.ids import Author, Incarnation
 from cairn_map.commits.key_proof import KeyProof
-from cairn_map.errors import BadInputError, CairnError, DeniedError, UnreachableError
+from cairn_map.errors import CairnError, DeniedError, UnreachableError
 from cairn_map.wire.access_messages import AskingRobot, KeyInfo, RobotKeyList
-from cairn_server.access.auth import Caller, Role
+from cairn_server.access.auth import Caller, Role, check_robot_name
 from cairn_server.access.challenges import Challenges, check_origin
-from cairn_server.access.rate_limits import HOUR_S, Allowance, allowance
+from cairn_server.access.rate_limits import HOUR_S, Buckets, TurnBuckets
 from cairn_server.access.shared_places import SharedPlaces
 from cairn_server.settings import Quotas
 from cairn_server.store.admission import Grounds
@@ -34,13 +34,16 @@ class Admissions:
     """Keys of the robots of a store's maps; called from many threads."""
 
     def __init__(self, store: Store, quotas: Quotas, *, steady_s: Callable[[], float] = time.monotonic) -> None:
-        self.challenges = Challenges(steady_s=steady_s)
+        shared = store.replicas
+        # A robot shows the proof to any server of the store: they share the secret, and the time of day.
+        self.challenges = (
+            Challenges(steady_s=steady_s) if shared is None else Challenges(secret=shared.secret, steady_s=time.time)
+        )
+        self._turns: Buckets = TurnBuckets(steady_s=steady_s) if shared is None else shared.uses
+        """Registrations left to each enrolment token."""
         self._store = store
         self._per_hour = quotas.registrations_per_hour
-        self._steady_s = steady_s
         self._lock = threading.Lock()
-        self._registrations: dict[str, Allowance] = {}
-        """Registrations left to each enrolment token, by its name."""
         self._asking: defaultdict[int, _Asking] = defaultdict(lambda: _Asking(ASKING_MAX))
         """By map; the asker is the name."""
 
@@ -109,8 +112,7 @@ class Admissions:
         Raises:
             BadInputError: kind `reserved_name`: servers speak in this name.
         """
-        if author.robot in SERVERS_OWN:
-            raise BadInputError("reserved_name", f"{author.robot} is not a robot's name")
+        check_robot_name(author.robot)
         self._store.keys.admit(row, author, by=by.name)
         self._store.audit_log.add(by.name, "admit", f"map {row.name}: {author}")
         with self._lock:
@@ -140,17 +142,15 @@ class Admissions:
     def _take(self, caller: Caller) -> None:
         if caller.role is not Role.ENROLLER or self._per_hour is None:
             return
-        now_s = self._steady_s()
-        with self._lock:
-            left = self._registrations.setdefault(
-                caller.name, allowance(self._per_hour, self._per_hour / HOUR_S, now_s=now_s)
-            )
-            wait_s = left.take(now_s)
+        wait_s = self._turns.take_turn(_bucket(caller), most=self._per_hour, per_s=self._per_hour / HOUR_S)
         if wait_s:
             message = f"the token {caller.name} may register {self._per_hour} robots an hour"
             raise UnreachableError("quota", message, retry_after_s=math.ceil(wait_s))
 
     def _give_back(self, caller: Caller) -> None:
-        with self._lock:
-            if caller.name in self._registrations:
-                self._registrations[caller.name].left += 1
+        if caller.role is Role.ENROLLER and self._per_hour is not None:
+            self._turns.give_turn(_bucket(caller))
+
+
+def _bucket(caller: Caller) -> str:
+    return f"registrations {caller.name}"

@@ -14,8 +14,8 @@ from cairn_map.errors import DamagedDataError
 from cairn_map.evidence.blocks import of_blocks
 from cairn_map.evidence.grid import Geometry, cell_of_key
 from cairn_map.wire.frames import CellFrame, FrameKind
+from cairn_server.cell_room import DECODING, changed_bytes
 from cairn_server.folding.cells_at_rest import sum_of_contributions
-from cairn_server.folding.decoding_room import DECODING
 from cairn_server.folding.read_cache import Change, ChangeName, ReadCache, state_of
 from cairn_server.store.stamps import blocks_after
 from cairn_server.store.store import Snapshot
@@ -77,7 +77,7 @@ def change_since(
         kind=change.kind,
         cell=row.key,
         from_cursor=start,
-        to_cursor=snapshot.head.cursor,
+        to_cursor=snapshot.head,
         fingerprint=row.fingerprint,
         own_excluded=change.kind is FrameKind.DELTA and asker is not None,
         blocks=change.blocks,
@@ -97,7 +97,10 @@ def _smallest(
     delta = _delta(snapshot, row, summed, geometry) if summed is not None else None
     smallest = row.size_bytes if delta is None else min(len(delta), row.size_bytes)
     state = None
-    if "state" in name.kinds:
+    # The blocks that one commit touched have all of its voxels and others: their present sums are hardly ever smaller,
+    # and cost a decoded cell.
+    is_own_sum = delta is not None and summed is not None and len(summed) == 1 and len(delta) < row.size_bytes
+    if "state" in name.kinds and not is_own_sum:
         state = _state(snapshot, row, name.after_seq, geometry, cache, size_bytes_max=smallest)
     if state is not None:
         return state
@@ -114,14 +117,16 @@ def _delta(snapshot: Snapshot, row: CellRow, foreign: list[Contribution], geomet
     if len(foreign) == 1 and foreign[0].kind == ENTRY_FOLD:
         return snapshot.diff(foreign[0].commit, row.key)  # one commit's diff is its own sum
     # Of several commits: decoded and added up, one cell at a time in the room that all requests share.
+    size_bytes = changed_bytes(geometry, row.voxels)
+    if size_bytes > DECODING.limit_bytes:
+        return None
     try:
-        # The sum, and one of the diffs.
-        with DECODING.of_cell(geometry, 2 * row.voxels):
+        with DECODING.of(size_bytes):
             evidence = sum_of_contributions(snapshot, row.key, foreign, geometry).packed()
+            return encode_cell(row.key, evidence, geometry).data if len(evidence) else b""
     except DamagedDataError as exc:
         log.error("cell %s: a diff at rest is damaged, sending the whole cell: %s", cell_of_key(row.key), exc.message)
         return None
-    return encode_cell(row.key, evidence, geometry).data if len(evidence) else b""
 
 
 def _state(

@@ -7,18 +7,27 @@ retracts, prior data) are signed by the server that hands them out, and accepted
 
 import hashlib
 import math
-from collections.abc import Callable, Collection
+import time
+from collections.abc import Callable, Collection, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 
 from cairn_map.commits.commit import CommitMeta, commit_bytes
 from cairn_map.commits.ids import OPERATOR, SERVERS_OWN, commit_id_from_text
 from cairn_map.commits.signature import Signature, SigningKey, signatures_to_text, speaks_for
-from cairn_map.errors import ConflictError, DeniedError, NotFoundError
+from cairn_map.errors import ConflictError, DeniedError, NotFoundError, UnreachableError
 from cairn_server.access.auth import Caller, Role
+from cairn_server.store.replica_notes import ReplicaNotes
 from cairn_server.store.store import Store
 from cairn_server.store.store_age import StoreAge
 from cairn_server.store.store_rows import MapRow
 from cairn_server.sync.retracting import seal_of
+
+MARKS_EVERY_S = 5.0
+"""Time between two readings of the marks that servers of one store share."""
+AGES_APART_S = 120.0
+"""More than the ages differ that servers of one store count, each by a clock of its own between two looks at it. A mark
+counts as so much older, so that none drops what was folded after it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,13 +98,27 @@ def found_commit(store: Store, row: MapRow, id_text: str) -> FoundCommit:
 
 
 class UpstreamProgress:
-    """Progress of handing this server's commits to its upstream server, for all maps; called from many threads."""
+    """Progress of handing this server's commits to its upstream server, for all maps; called from many threads.
 
-    def __init__(self, age: StoreAge, *, is_joined: bool) -> None:
-        """Args: age: of the server's store. is_joined: True if the server has an upstream server."""
+    Where several servers share the store, it is noted there, under the upstream's URL: any of them drops evidence by
+    it.
+    """
+
+    def __init__(
+        self,
+        age: StoreAge,
+        upstream: str | None,
+        notes: ReplicaNotes | None,
+        *,
+        steady_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Args: age: of the server's store. upstream: URL of the upstream server, if there is one. notes: shared."""
         self._age = age
-        self._is_joined = is_joined
-        self._handed_over_s: dict[str, float] = {}
+        self._upstream = upstream
+        self._notes = notes
+        self._steady_s = steady_s
+        self._read_next_s = -math.inf
+        self._handed_over_s: Mapping[str, float] = {}
         self._wake_relay: Callable[[], None] = lambda: None
 
     def connect(self, wake_relay: Callable[[], None]) -> None:
@@ -108,13 +131,27 @@ class UpstreamProgress:
 
     def handed_over(self, map_name: str, begun_s: float) -> None:
         """Note that all of a map's commits as of this age of the store that can travel are on the upstream."""
-        self._handed_over_s[map_name] = begun_s
+        if self._notes is None or self._upstream is None:
+            self._handed_over_s = {**self._handed_over_s, map_name: begun_s}
+            return
+        with suppress(UnreachableError):  # the next round notes a later age
+            self._notes.put_handed_over(self._upstream, map_name, begun_s)
+        self._read_next_s = -math.inf
 
     def ages_s(self) -> dict[str, float]:
         """Seconds since all of a map was handed to the upstream server, by the map's name."""
         now_s = self._age.now_s()
-        return {name: now_s - begun_s for name, begun_s in list(self._handed_over_s.items())}
+        return {name: now_s - begun_s for name, begun_s in self._marks().items()}
 
     def may_forget_s(self, map_name: str) -> float:
         """Age of the store before which evidence is on the upstream, too, and may go; infinite without one."""
-        return self._handed_over_s.get(map_name, -math.inf) if self._is_joined else math.inf
+        if self._upstream is None:
+            return math.inf
+        return self._marks().get(map_name, -math.inf) - (AGES_APART_S if self._notes is not None else 0.0)
+
+    def _marks(self) -> Mapping[str, float]:
+        if self._notes is not None and self._upstream is not None and self._steady_s() >= self._read_next_s:
+            # A mark that is some seconds old keeps evidence longer, never shorter.
+            self._read_next_s = self._steady_s() + MARKS_EVERY_S
+            self._handed_over_s = self._notes.handed_over(self._upstream)
+        return self._handed_over_s

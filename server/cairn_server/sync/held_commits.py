@@ -12,7 +12,7 @@ from cairn_map.commits.ids import Author, CommitId, RobotName
 from cairn_map.wire.messages import WANTED_MAX
 from cairn_map.wire.relay_peer import SUM_BYTES, Held, sum_of_shas
 from cairn_server.access.shared_places import SharedPlaces
-from cairn_server.store.history import is_proven
+from cairn_server.store.history import head_of, is_proven
 from cairn_server.store.store import Snapshot, Store
 from cairn_server.store.store_rows import MapRow
 
@@ -36,13 +36,13 @@ class HeldCommits:
             with self._locks.setdefault(row.number, threading.Lock()):  # one log may take long to read
                 sums = self._sums_in(row, snapshot)
             return Held(
-                vector=snapshot.head.vector.with_commits(pending),
+                vector=head_of(snapshot).vector.with_commits(pending),
                 wanted=self._wanted.of(row.name),
                 sums={author: total for author, total in sums.items() if author not in pending.intervals},
             )
 
     def _sums_in(self, row: MapRow, snapshot: Snapshot) -> dict[Author, bytes]:
-        head = snapshot.head.cursor
+        head = snapshot.head
         known, sums = self._sums.get(row.number, (None, {}))
         # A store that was restored has another history behind the same number.
         if known is None or not is_proven(known, snapshot):

@@ -10,14 +10,14 @@ proves it, and `lm` of each cell says whether it changed since. For each cell th
 import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import compress, islice
+from itertools import islice
 
 import numpy as np
 import numpy.typing as npt
 
 from cairn_map.commits.cursor import Cursor, cursor_from_text
 from cairn_map.commits.ids import OPERATOR, Author, CommitId, author_from_text
-from cairn_map.commits.version_vector import VersionVector
+from cairn_map.commits.version_vector import EMPTY, VersionVector
 from cairn_map.errors import ConflictError
 from cairn_map.evidence.cell_order import first_to_last
 from cairn_map.evidence.fingerprint import ZERO, Fingerprint
@@ -31,9 +31,10 @@ from cairn_server.folding.cells import CellFaults
 from cairn_server.folding.cells_at_rest import DamagedCellError, sound_cell
 from cairn_server.folding.damaged_cells import as_named
 from cairn_server.folding.read_cache import ReadCache
-from cairn_server.store.history import is_proven
+from cairn_server.store.history import folded_ids, is_proven
 from cairn_server.store.store import Snapshot
 from cairn_server.store.store_rows import CellRow
+from cairn_server.store.tiles import is_in_box
 from cairn_server.sync.asked_cells import Asked, ListedCells, listed_cells
 from cairn_server.sync.cell_changes import change_since
 
@@ -45,6 +46,8 @@ RETRACTS_MAX = 1024
 """Most retracts that a header lists, for robots that do not find them in its vectors: 64 kB."""
 PENDING_AUTHORS_MAX = 256
 """Most authors whose pending commits are named to an asker without an author, who only sees that something is."""
+SINCE_ENTRIES_MAX = 4096
+"""Most log entries that are read to name the commits since a state; an asker farther behind gets the whole vector."""
 EMPTY_CELLS_MAX = 4096
 """Cells that a reply sends as empty since the server never had them; then it ends with `more`, too."""
 
@@ -59,6 +62,15 @@ class HeaderFacts:
     """Cells that robots are asked for."""
     wanted: tuple[CommitId, ...] = ()
     """Commits that robots are asked to push again."""
+
+
+@dataclass(frozen=True, slots=True)
+class Since:
+    """State after which a header's vector begins."""
+
+    text: str
+    """As the request states it."""
+    cursor: Cursor
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,14 +91,12 @@ class MissingQuery:
     box: tuple[Cell, Cell] | None
     size_bytes_max: int
     near: Cell | None
+    since: Since | None = None
+    """State whose vector the asker has, proven by the log."""
 
     def wants(self, keys: UInts) -> npt.NDArray[np.bool_]:
         """True for each of these cells that lies in the box asked for, shape (len(keys),)."""
-        if self.box is None:
-            return np.ones(len(keys), np.bool_)
-        indices, (low, high) = deinterleave(keys) - CELL_LIMIT, self.box
-        is_beside = (indices < low) | (indices > high)
-        return ~np.asarray(is_beside.any(axis=1), np.bool_)
+        return np.ones(len(keys), np.bool_) if self.box is None else is_in_box(keys, self.box)
 
     def is_reset(self, start: Cursor | None) -> bool:
         """True if a cell of this state is answered by its fingerprint: the asker finds out what it has to drop."""
@@ -103,7 +113,7 @@ def query_of(asked: Asked, snapshot: Snapshot) -> MissingQuery:
     # Each cursor once, however many cells name it: proving one reads the log.
     request, cursor = asked.request, _cursor(asked.request.cursor)
     cursors = tuple(_cursor(text) for text in asked.cursors)
-    head = snapshot.head.cursor
+    head = snapshot.head
     unproven: set[Cursor] = set()
     cancellation = CANCELLATION.get()
     for stated in {stated for stated in (cursor, *cursors) if stated is not None}:
@@ -123,29 +133,47 @@ def query_of(asked: Asked, snapshot: Snapshot) -> MissingQuery:
         box=(Cell(*request.box[0]), Cell(*request.box[1])) if request.box else None,
         size_bytes_max=min(request.size_bytes_max or REPLY_BYTES_MAX, REPLY_BYTES_MAX),
         near=cell_of_key(cell_key(request.near)) if request.near else None,
+        since=proven_since(request.since, snapshot, default=cursor),
     )
 
 
-def header_of(snapshot: Snapshot, author: Author | None, facts: HeaderFacts) -> ReplyHeader:
+def proven_since(text: str | None, snapshot: Snapshot, *, default: Cursor | None = None) -> Since | None:
+    """State after which a header's vector begins; None: it is whole, for no such state is stated, or it is no good."""
+    cursor = default if text == "cursor" else _cursor(text)
+    if text is None or cursor is None or cursor.log_id != snapshot.head.log_id:
+        return None
+    is_near = snapshot.head.seq - cursor.seq <= SINCE_ENTRIES_MAX
+    return Since(text, cursor) if is_near and is_proven(cursor, snapshot) else None
+
+
+def header_of(
+    snapshot: Snapshot, author: Author | None, facts: HeaderFacts, *, since: Since | None = None
+) -> ReplyHeader:
     """State of a snapshot, as the author of some of its commits needs to know it.
+
+    With `since` the vector names only the commits folded after that state, which the snapshot's log proves.
 
     The vector alone speaks of all authors: what is stable or pending matters only of commits that the asker may hold,
     its robot's own and the operator's. So no number of commits of other robots makes the rest of a header grow.
     """
     # Rule 3: the vector is whole, for all ids; the tip shows an author that its disk was rolled back (rule 13).
-    head = snapshot.head
+    head, whole = snapshot.head, snapshot.vector_at(snapshot.head.seq)
+    vector = whole
+    if since is not None:
+        vector = EMPTY.with_commits(folded_ids(snapshot, after_seq=since.cursor.seq, to_seq=head.seq))
     tip = snapshot.tip(author) if author else None
     held = (OPERATOR, author.robot) if author else (OPERATOR,)
     stable, pending = facts.stable.of_robots(held), snapshot.pending()
     pending = pending.of_robots(held) if author else _first_authors(pending)
     # Not validated again: with hundreds of authors that takes longer than the rest of a reply.
     return ReplyHeader.model_construct(
-        to=str(head.cursor),
-        vector=head.vector.to_json(),
+        to=str(head),
+        vector=vector.to_json(),
+        since=since.text if since is not None else None,
         stable=stable.to_json(),
         pending=pending.to_json(),
         tip=(tip[0], tip[1].hex()) if tip else None,
-        retracts=_newest_retracts(head.vector, stable),
+        retracts=_newest_retracts(whole, stable),
         damaged=as_named(snapshot, facts.damaged),
         wanted=[str(commit) for commit in facts.wanted],
     )
@@ -191,7 +219,7 @@ class CellFrames:
         # At a proven state it is empty already.
         else:
             return None
-        to = self.snapshot.head.cursor
+        to = self.snapshot.head
         return EmptyCellFrames(kind=kind, cells=keys, from_cursor=start, to_cursor=to, geometry=self.geometry)
 
     def _body(self, key: CellKey) -> bytes:
@@ -207,21 +235,21 @@ class CellFrames:
     def _frame(
         self, kind: FrameKind, key: CellKey, start: Cursor | None, fingerprint: Fingerprint, payload: bytes = b""
     ) -> CellFrame:
-        to = self.snapshot.head.cursor
+        to = self.snapshot.head
         return CellFrame(kind=kind, cell=key, from_cursor=start, to_cursor=to, fingerprint=fingerprint, payload=payload)
 
 
 def reply_frames(cells: CellFrames, facts: HeaderFacts) -> Iterator[Frame | EmptyCellFrames]:
     """Header, frames of the cells that the asker misses, and the end of a reply."""
     snapshot, query, listed = cells.snapshot, cells.query, cells.query.listed
-    to = str(snapshot.head.cursor)
+    to = str(snapshot.head)
     # All from one snapshot (rule 3): what is folded meanwhile is wholly in the next reply.
-    yield header_of(snapshot, query.author, facts)
+    yield header_of(snapshot, query.author, facts, since=query.since)
     # Every cell of main: a frame, or its fingerprint in `rest`, so that the asker can check the whole map.
-    rest = ZERO
+    rest = snapshot.fingerprint_sum(query.box)
     sent_bytes = 0
     cancellation = CANCELLATION.get()
-    rows = in_order(_wanted(snapshot.cells(), query), query.near)
+    rows = in_order(_candidates(snapshot, query), query.near)
     places = listed.places(_keys_of(rows))
     for row, place in zip(rows, places.tolist(), strict=True):
         cancellation.check()
@@ -231,8 +259,8 @@ def reply_frames(cells: CellFrames, facts: HeaderFacts) -> Iterator[Frame | Empt
             continue
         frame = cells.frame_of(row, start)
         if frame is None:
-            rest += row.fingerprint
             continue
+        rest -= row.fingerprint
         # At least one frame in each reply, so that every reply brings the asker on.
         sent_bytes += frame.size_bytes
         yield frame
@@ -259,10 +287,19 @@ def _keys_of(rows: Sequence[CellRow]) -> UInts:
     return np.fromiter((row.key for row in rows), np.uint64, len(rows))
 
 
-def _wanted(rows: Iterator[CellRow], query: MissingQuery) -> list[CellRow]:
-    """Those of these cells that lie in the box asked for."""
-    found = list(rows)
-    return found if query.box is None else list(compress(found, query.wants(_keys_of(found))))
+def _candidates(snapshot: Snapshot, query: MissingQuery) -> list[CellRow]:
+    """Cells of main that may get a frame: all others stand at the asker's state."""
+    # Cells at no proven state get one each.
+    if query.cursor is None or query.is_reset(query.cursor):
+        return list(snapshot.cells(box=query.box))
+    listed = query.listed.keys[query.wants(query.listed.keys)]
+    # A list longer than the map: reading through the map is less than asking for each.
+    if len(listed) > snapshot.totals().cells:
+        return list(snapshot.cells(box=query.box))
+    # What changed since the state of the cells that are not listed, and the listed ones, whatever their state.
+    changed = {row.key: row for row in snapshot.cells(after_seq=query.cursor.seq, box=query.box)}
+    more = snapshot.cells_of([key for key in map(CellKey, listed.tolist()) if key not in changed])
+    return [*changed.values(), *more]
 
 
 def _newest_retracts(vector: VersionVector, stable: VersionVector) -> list[str]:

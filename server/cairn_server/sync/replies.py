@@ -1,11 +1,10 @@
 """Answers about the state of main: replies to fetch-missing, the cell index, the version vector at a cursor."""
 
-import threading
 from collections.abc import Iterable, Iterator
 
-from cairn_map.commits.cursor import ENTRY_FOLD, Cursor
+from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.ids import Author
-from cairn_map.commits.version_vector import EMPTY, VersionVector
+from cairn_map.commits.version_vector import VersionVector
 from cairn_map.errors import ConflictError, NotFoundError
 from cairn_map.wire.empty_cell_frames import EmptyCellFrames
 from cairn_map.wire.frames import Frame, encode_frame, start_of_reply
@@ -22,38 +21,21 @@ from cairn_server.store.store_age import StoreAge
 from cairn_server.store.store_rows import MapRow
 from cairn_server.sync.asked_cells import Asked
 from cairn_server.sync.held_commits import WantedCommits
-from cairn_server.sync.missing import CellFrames, HeaderFacts, header_of, query_of, reply_frames
-
-ENTRIES_MAX = 10_000
-"""Most log entries between the head and a cursor whose vector is asked for: clients ask for cursors just received."""
-KEEP_S = 10.0
-"""Lifetime of a stable vector: it only ever grows, so an old one is safe."""
+from cairn_server.sync.missing import CellFrames, HeaderFacts, header_of, proven_since, query_of, reply_frames
 
 
 class StableVectors:
-    """Commits that no restore can lose any more, of all maps: those folded longer ago than a setting; thread-safe."""
+    """Commits that no restore can lose any more, of all maps: those folded longer ago than a setting."""
 
     def __init__(self, age: StoreAge, after_s: float) -> None:
         """Args: age: of the store. after_s: age since its folding at which a commit is stable."""
         self._age = age
         self._after_s = after_s
-        self._keep_s = min(KEEP_S, after_s)
-        self._lock = threading.Lock()
-        self._kept: dict[int, tuple[float, Cursor, VersionVector]] = {}
 
-    def of(self, row: MapRow, snapshot: Snapshot) -> VersionVector:
-        """Stable vector of the map in this snapshot, at most `KEEP_S` old."""
-        # Many robots ask at once, and only one of them has the log read: the others wait for its result.
-        now_s = self._age.now_s()
-        with self._lock:
-            if row.number in self._kept:
-                made_s, cursor, vector = self._kept[row.number]
-                # A vector of entries that a restore took away would end the only copies of their commits.
-                if now_s - made_s < self._keep_s and is_proven(cursor, snapshot):
-                    return vector
-            vector = snapshot.folded_before(now_s - self._after_s)
-            self._kept[row.number] = (now_s, snapshot.head.cursor, vector)
-            return vector
+    def of(self, snapshot: Snapshot) -> VersionVector:
+        """Stable vector of the map in this snapshot."""
+        # Of this log alone: ids that a restore took away would end the only copies of their commits.
+        return snapshot.vector_at(snapshot.seq_before(self._age.now_s() - self._after_s))
 
 
 class MainReplies:
@@ -100,34 +82,35 @@ class MainReplies:
         known = asked.request.known
         return b"" if known is not None and known == reply_digest(reply) else reply
 
-    def cell_index(self, row: MapRow, author: Author | None, page: IndexPage = FIRST_PAGE) -> CellIndex:
-        """One page of the cells that were ever touched, and the state that it was read from."""
+    def cell_index(
+        self, row: MapRow, author: Author | None, page: IndexPage = FIRST_PAGE, *, since: str | None = None
+    ) -> CellIndex:
+        """One page of the cells that were ever touched, and the state that it was read from.
+
+        The header's vector is whole, or begins after the cursor `since` if that is proven.
+        """
+        # Both from one state: an entry that changed after it is in a later page's.
         with self._store.snapshot(row) as snapshot:
-            header = header_of(snapshot, author, self._facts(row, snapshot))
+            header = header_of(snapshot, author, self._facts(row, snapshot), since=proven_since(since, snapshot))
             return CellIndex(header=header, cells=entries_of(snapshot, page))
 
     def vector_at(self, row: MapRow, cursor: Cursor) -> VersionVector:
-        """Version vector at a recent cursor: that of the head without what was folded since.
+        """Version vector at a cursor.
 
         Raises:
             ConflictError: kind `other_log`: the cursor is another server's.
-            NotFoundError: kind `no_cursor`: it is not proven by the log, or too far back.
+            NotFoundError: kind `no_cursor`: it is not proven by the log.
         """
         with self._store.snapshot(row) as snapshot:
-            head = snapshot.head
-            if cursor.log_id != head.cursor.log_id:
+            if cursor.log_id != snapshot.head.log_id:
                 raise ConflictError("other_log", "the cursor belongs to another server's log; start without one")
-            # Proven by its chain, and recent, so that few entries have to be read.
-            since = head.cursor.seq - cursor.seq
-            if not 0 <= since <= ENTRIES_MAX or snapshot.chain_at(cursor.seq) != cursor.chain:
-                raise NotFoundError("no_cursor", "the log has no such recent cursor; ask for the cell again")
-            # Only `+` puts an id into the vector; what is taken out again stays in it.
-            entries = snapshot.chained(after_seq=cursor.seq, limit=ENTRIES_MAX)
-            folded = EMPTY.with_commits(entry.commit for entry in entries if entry.kind == ENTRY_FOLD)
-            return head.vector.minus(folded)
+            # By its chain: the asker has a cell of exactly this state.
+            if not is_proven(cursor, snapshot):
+                raise NotFoundError("no_cursor", "the log has no such cursor; ask for the cell again")
+            return snapshot.vector_at(cursor.seq)
 
     def _facts(self, row: MapRow, snapshot: Snapshot) -> HeaderFacts:
-        return HeaderFacts(self._stable.of(row, snapshot), self._cells.damaged(row), self._wanted.of(row.name))
+        return HeaderFacts(self._stable.of(snapshot), self._cells.damaged(row), self._wanted.of(row.name))
 
 
 def _encoded(frames: Iterable[Frame | EmptyCellFrames]) -> Iterator[bytes]:

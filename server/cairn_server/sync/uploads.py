@@ -1,11 +1,13 @@
 """Uploads: bodies of commits that come in parts, so that a broken link goes on where it stopped.
 
-They are in memory only: losing them costs bytes, never evidence. A robot pushes its commits one after the other, so it
-has one upload here, and a second one while an amend waits for what it takes out. Only bytes received take room, not
-announced ones. Only the whole body is checked and acknowledged, by the steps of a push.
+They are in this process's memory (`staged_bodies`), or in the notes of a store that several servers work on: losing
+them costs bytes, never evidence. A robot pushes its commits one after the other, so it has one upload here, and a
+second one while an amend waits for what it takes out. Only bytes received take room, not announced ones. Only the whole
+body is checked and acknowledged, by the steps of a push.
 
-Where there is no room, who holds most gives way: the robot of the largest share loses what it left idle longest, and if
-that is the robot that sends, it waits. So no upload goes for one whose robot holds more, and small ones never go.
+Where there is no room, who holds most gives way: the robot of the largest share, on all maps together, loses what it
+left idle longest, and if that is the robot that sends, it waits. So no upload goes for one whose robot holds more, and
+small ones never go.
 """
 
 import hashlib
@@ -13,7 +15,6 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
 
 from cairn_map.commits.commit import COMMIT_BYTES_MAX
 from cairn_map.commits.ids import CommitId, commit_id_from_text
@@ -21,9 +22,11 @@ from cairn_map.errors import BadInputError, CairnError, DeniedError, Unreachable
 from cairn_map.wire.messages import Upload
 from cairn_server.access.auth import Caller, Role
 from cairn_server.store.numbering import EvidenceGoneError
+from cairn_server.store.replica_notes import BodyPart, BodyPlace, StagedBodies, StagedBody
 from cairn_server.store.store import Store
 from cairn_server.store.store_rows import MapRow
 from cairn_server.sync.pushes import Pushes
+from cairn_server.sync.staged_bodies import OwnStagedBodies
 
 STAGED_BYTES_MAX = 1 << 27
 """Most bytes held, of all robots together."""
@@ -33,38 +36,6 @@ KEPT_S = 86_400.0
 """Time without a new part after which an upload is dropped."""
 IDLE_S = 900.0
 """Time without a new part after which an upload gives way to any other: on the slowest link parts come every 260 s."""
-
-Place = tuple[int, str, CommitId]
-"""Place of an upload: map, robot or relay, and commit."""
-
-
-@dataclass(frozen=True, slots=True)
-class Part:
-    """Part of a body."""
-
-    digest: str
-    """Hex of the whole body's SHA-256."""
-    total_bytes: int
-    offset_bytes: int
-    data: bytes
-    signatures: str | None = None
-    """Text of the header `Cairn-Signature`; the one that comes with the last part counts."""
-
-
-@dataclass(slots=True)
-class _Staged:
-    """Beginning of a body."""
-
-    digest: str
-    total_bytes: int
-    used_s: float
-    data: bytearray = field(default_factory=bytearray)
-
-    def add(self, part: Part, now_s: float) -> None:
-        """Append a part, if it begins where the last one ended."""
-        if part.offset_bytes == len(self.data):
-            self.data += part.data
-        self.used_s = now_s
 
 
 def uploaded_by(caller: Caller, id_text: str) -> tuple[CommitId, str]:
@@ -88,9 +59,10 @@ class Uploads:
     def __init__(self, store: Store, pushes: Pushes, *, steady_s: Callable[[], float] = time.monotonic) -> None:
         self._store = store
         self._pushes = pushes
-        self._steady_s = steady_s
+        self._bodies: StagedBodies = OwnStagedBodies(steady_s) if store.replicas is None else store.replicas.bodies
         self._lock = threading.Lock()
-        self._staged: dict[Place, _Staged] = {}
+        """Other servers of the store do not wait for it: parts that come at once may go over the bounds by themselves.
+        """
 
     def state(self, row: MapRow, caller: Caller, id_text: str, digest: str) -> Upload:
         """State of an upload: the bytes received, and the SHA-256 of the commit if it is kept.
@@ -100,16 +72,16 @@ class Uploads:
         """
         commit, robot = uploaded_by(caller, id_text)
         kept = self._store.commit(row, commit)
-        with self._lock:
-            found = self._at((row.number, robot, commit), digest)
-            return Upload(
-                size_bytes=len(found.data) if found else 0, sha=kept.sha.hex() if kept and not kept.gone else None
-            )
+        size_bytes = self._size(BodyPlace(row.number, robot, commit), digest)
+        return Upload(size_bytes=size_bytes, sha=kept.sha.hex() if kept and not kept.gone else None)
 
-    def add(self, row: MapRow, caller: Caller, id_text: str, part: Part) -> tuple[Upload, bool]:
+    def add(
+        self, row: MapRow, caller: Caller, id_text: str, part: BodyPart, *, signatures: str | None = None
+    ) -> tuple[Upload, bool]:
         """Add a part, and push the commit if it was the last one; the upload's state, and True if the commit is new.
 
-        A part that does not begin where the last one ended is ignored; the state says where to go on.
+        A part that does not begin where the last one ended is ignored; the state says where to go on. `signatures` is
+        the text of the header `Cairn-Signature`; that of the last part counts.
 
         Raises:
             BadInputError: kind `too_large`; or, with the last part, as a push.
@@ -117,7 +89,7 @@ class Uploads:
                 tries again.
         """
         commit, robot = uploaded_by(caller, id_text)
-        place = (row.number, robot, commit)
+        place = BodyPlace(row.number, robot, commit)
         if part.total_bytes > COMMIT_BYTES_MAX or part.offset_bytes + len(part.data) > part.total_bytes:
             raise BadInputError(
                 "too_large",
@@ -130,89 +102,91 @@ class Uploads:
         if whole is None:
             return Upload(size_bytes=self._size(place, part.digest)), False
         if hashlib.sha256(whole).hexdigest() != part.digest:
-            self._drop(place)
+            self._bodies.drop(place)
             return Upload(size_bytes=0), False
         try:
-            is_new = self._pushes.keep(row, caller, id_text, whole, signatures=part.signatures)
+            is_new = self._pushes.keep(row, caller, id_text, whole, signatures=signatures)
         except (UnreachableError, EvidenceGoneError):
             raise
         except CairnError:
-            self._drop(place)
+            self._bodies.drop(place)
             raise
-        self._drop(place)
+        self._bodies.drop(place)
         kept = self._store.commit(row, commit)
         return Upload(size_bytes=len(whole), sha=kept.sha.hex() if kept else None), is_new
 
     def staged_bytes(self) -> int:
-        """Bytes held in memory."""
-        with self._lock:
-            return sum(len(found.data) for found in self._staged.values())
+        """Bytes held."""
+        return sum(body.size_bytes for body in self._bodies.all())
 
-    def _take(self, place: Place, part: Part) -> bytes | None:
+    def _take(self, place: BodyPlace, part: BodyPart) -> bytes | None:
         """Add a part to its upload; the whole body, if this was its last part.
 
         Raises:
             UnreachableError: kind `busy`: there is no room for it; what came before stays.
         """
+        if not part.total_bytes:
+            return b""
         with self._lock:
-            found = self._at(place, part.digest)
-            if found is None or found.total_bytes != part.total_bytes:
-                found = _Staged(part.digest, part.total_bytes, self._steady_s())
-            is_next = part.offset_bytes == len(found.data)
-            size_bytes = len(found.data) + (len(part.data) if is_next else 0)
-            if size_bytes:
-                self._make_room(place, size_bytes)
-                self._staged.pop(place, None)
-                self._staged[place] = found  # the one used last stands last
-            found.add(part, self._steady_s())
-            return bytes(found.data) if len(found.data) == found.total_bytes else None
+            found = self._bodies.at(place)
+            is_begun = found is not None and (found.digest, found.total_bytes) == (part.digest, part.total_bytes)
+            size_bytes = found.size_bytes if found is not None and is_begun else 0
+            if part.offset_bytes == size_bytes:
+                size_bytes += len(part.data)
+            if not size_bytes:
+                return None
+            self._make_room(place, size_bytes)
+            staged = self._bodies.append(place, part)
+        if staged is None or staged.digest != part.digest or staged.size_bytes < part.total_bytes:
+            return None
+        return self._bodies.body(place, part.digest)
 
-    def _make_room(self, place: Place, size_bytes: int) -> None:
+    def _make_room(self, place: BodyPlace, size_bytes: int) -> None:
         """Drop the robot's own uploads beyond `BODIES_MAX`, old ones, and of the rest as many as must give way.
 
         Raises:
             UnreachableError: kind `busy`: this robot itself holds most.
         """
-        now_s = self._steady_s()
-        own = [other for other in self._staged if other[:2] == place[:2] and other != place]
-        for other in own[: max(0, len(own) + 1 - BODIES_MAX)]:
-            del self._staged[other]
-        for other, found in list(self._staged.items()):
-            if now_s - found.used_s > KEPT_S:
-                del self._staged[other]
-        while sum((sizes := self._sizes(place, size_bytes)).values()) > STAGED_BYTES_MAX:
-            del self._staged[self._giving_way(place, sizes, now_s)]
+        others = [body for body in self._bodies.all() if body.place != place]
+        own = [body for body in others if body.place[:2] == place[:2]]
+        gone = own[: max(0, len(own) + 1 - BODIES_MAX)] + [body for body in others if body.idle_s > KEPT_S]
+        others = [body for body in others if body not in gone]
+        while sum(body.size_bytes for body in others) + size_bytes > STAGED_BYTES_MAX:
+            try:
+                found = _giving_way(place.robot, size_bytes, others)
+            except UnreachableError:
+                self._drop(gone)
+                raise
+            gone.append(found)
+            others.remove(found)
+        self._drop(gone)
 
-    def _sizes(self, place: Place, size_bytes: int) -> dict[Place, int]:
-        """Bytes of every upload, of the one at `place` those that it is to have."""
-        return {other: len(found.data) for other, found in self._staged.items()} | {place: size_bytes}
+    def _drop(self, bodies: list[StagedBody]) -> None:
+        for body in bodies:
+            self._bodies.drop(body.place)
 
-    def _giving_way(self, place: Place, sizes: dict[Place, int], now_s: float) -> Place:
-        """Upload to drop next, other than the one at `place`."""
-        others = [other for other in self._staged if other != place]  # longest idle first
-        if others and now_s - self._staged[others[0]].used_s > IDLE_S:
-            return others[0]
-        of_robot: Counter[tuple[int, str]] = Counter()
-        for other, size in sizes.items():
-            of_robot[other[:2]] += size
-        # Of equal ones any gives way, but never the robot that sends.
-        most = max(of_robot[other[:2]] for other in sizes)
-        found = next((other for other in others if of_robot[other[:2]] == most), None)
-        if found is None:
-            raise UnreachableError(
-                "busy", "no room for more parts of this commit: other robots' uploads are here", retry_after_s=30.0
-            )
-        return found
+    def _size(self, place: BodyPlace, digest: str) -> int:
+        found = self._bodies.at(place)
+        return found.size_bytes if found is not None and found.digest == digest else 0
 
-    def _size(self, place: Place, digest: str) -> int:
-        with self._lock:
-            found = self._at(place, digest)
-            return len(found.data) if found else 0
 
-    def _at(self, place: Place, digest: str) -> _Staged | None:
-        found = self._staged.get(place)
-        return found if found and found.digest == digest else None
+def _giving_way(robot: str, size_bytes: int, others: list[StagedBody]) -> StagedBody:
+    """Upload to drop next for one that is to have so many bytes; `others`: the longest idle first.
 
-    def _drop(self, place: Place) -> None:
-        with self._lock:
-            self._staged.pop(place, None)
+    Raises:
+        UnreachableError: kind `busy`: this robot itself holds most.
+    """
+    if others and others[0].idle_s > IDLE_S:
+        return others[0]
+    # By name: a robot may be on any number of maps, and would have a share on each.
+    of_robot = Counter({robot: size_bytes})
+    for body in others:
+        of_robot[body.place.robot] += body.size_bytes
+    # Of equal ones any gives way, but never the robot that sends.
+    most = max(of_robot.values())
+    found = next((body for body in others if of_robot[body.place.robot] == most), None)
+    if found is None:
+        raise UnreachableError(
+            "busy", "no room for more parts of this commit: other robots' uploads are here", retry_after_s=30.0
+        )
+    return found

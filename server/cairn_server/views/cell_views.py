@@ -20,9 +20,9 @@ from cairn_map.evidence.grid import CellKey, Geometry, cell_of_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.evidence.view import ViewStyle
 from cairn_map.files.cell_files import CELL_MEDIA_TYPE, MEDIA_TYPES, cell_file
+from cairn_server.cell_room import DECODING
 from cairn_server.folding.cells import Cells
 from cairn_server.folding.cells_at_rest import stored_evidence, stored_surfaces
-from cairn_server.folding.decoding_room import DECODING
 from cairn_server.store.store import Store
 from cairn_server.store.store_rows import CellRow, Head, MapRow
 
@@ -30,7 +30,7 @@ BYTES_MAX = 1 << 26
 """Most bytes of all views kept; 56 cells of 4 cm have 2 MB of views at their voxels, 3 MB at all depths."""
 DEPTHS_ABOVE_VOXELS = 3
 """Depth above the voxels of the views that pages ask for first: COARSE in console/src/scene/detail.ts."""
-FILE_VOXELS_MAX = 1 << 22
+FILE_VOXELS_MAX = 1 << 20
 """Known voxels of a cell that is made into an NPZ or PLY file: some 330 bytes of memory each."""
 BUNDLE_MEDIA_TYPE = "application/vnd.cairn.views"
 BUNDLE_CELLS_MAX = 10_000

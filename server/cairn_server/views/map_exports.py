@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import IO
 
+from cairn_map.commits.cursor import Cursor
 from cairn_map.errors import BadInputError, CairnError, DeniedError, UnreachableError
 from cairn_map.evidence.evidence import Evidence, empty_evidence
 from cairn_map.evidence.grid import CellKey
@@ -34,11 +35,11 @@ from cairn_map.files.point_clouds import (
     size_of_file,
 )
 from cairn_server.access.cancellation import CANCELLATION
+from cairn_server.cell_room import DECODING, voxels_of
 from cairn_server.folding.cells import Cells
 from cairn_server.folding.cells_at_rest import DamagedCellError, decode_stored, sound_cell, stored_evidence
-from cairn_server.folding.decoding_room import DECODING, voxels_of
 from cairn_server.store.store import Snapshot, Store
-from cairn_server.store.store_rows import CellRow, Head, MapRow
+from cairn_server.store.store_rows import CellRow, MapRow
 
 log = logging.getLogger(__name__)
 
@@ -56,7 +57,7 @@ WAIT_S = 5.0
 class Export:
     """A file on its way: the state that it is of, its size (None: not known yet), and its bytes."""
 
-    head: Head
+    head: Cursor
     count: int
     size_bytes: int | None
     parts: Iterator[bytes]

@@ -29,14 +29,14 @@ from cairn_map.render.render_picture import Layer, png_of
 from cairn_map.render.render_request import RenderRequest
 from cairn_map.warm_up import warm_up_pictures
 from cairn_server.access.cancellation import CANCELLATION, Cancellation
+from cairn_server.cell_room import DECODING
 from cairn_server.folding.cells import Cells
 from cairn_server.folding.cells_at_rest import DamagedCellError, row_of_cell, sound_cell, stored_evidence
-from cairn_server.folding.decoding_room import DECODING
 from cairn_server.folding.read_cache import State, state_of
 from cairn_server.folding.single_flight import MadeOnce
 from cairn_server.store.stamps import Stamps, decode_stamps, no_stamps
 from cairn_server.store.store import Snapshot, Store
-from cairn_server.store.store_rows import CellRow, Head, MapRow
+from cairn_server.store.store_rows import CellRow, MapRow
 
 log = logging.getLogger(__name__)
 
@@ -64,7 +64,7 @@ class AskedView:
     """A picture's ETag, the state that it shows, and its bytes; none if the asker has them."""
 
     etag: str
-    head: Head
+    head: Cursor
     body: bytes | None
 
 
@@ -188,7 +188,7 @@ class MapViews:
             listed = {cell.key: cell for cell in snapshot.cells() if cell.voxels}
             return listed, np.array([cell_of_key(key) for key in listed], np.int64).reshape(-1, 3)
 
-        return self._lists.get(snapshot.head.cursor, make)
+        return self._lists.get(snapshot.head, make)
 
     def _read(self, task: _Task, wanted: Sequence[CellKey]) -> dict[CellKey, ReadCell]:
         """Cells from the store, decoded side by side."""
@@ -293,7 +293,7 @@ def _ready(stored: CellRow | None, task: _Task) -> ReadCell:
         return read_cell(brick_cell(geometry, [stored_evidence(stored)]), geometry, model, task.layer)
 
 
-def _etag(head: Head, request: RenderRequest) -> str:
+def _etag(head: Cursor, request: RenderRequest) -> str:
     """Strong: the same map and the same request give the same bytes."""
-    text = f"{VERSION} {head.cursor} {request.model_dump_json()}"
+    text = f"{VERSION} {head} {request.model_dump_json()}"
     return f'"{hashlib.sha256(text.encode()).hexdigest()[:32]}"'

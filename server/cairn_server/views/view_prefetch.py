@@ -52,13 +52,14 @@ class ViewPrefetch:
         # Numba takes half a second to load the first kernel, for which the first page would wait.
         cell_of_key(cell_key((0, 0, 0)))
         while not self._closing.is_set():
-            for row in self._rows():
-                self._make_all(row)
+            for row, cursor in self._heads():
+                if self._seen.get(row.number) != cursor:
+                    self._make_all(row)
             self._closing.wait(self._look_every_s)
 
-    def _rows(self) -> list[MapRow]:
+    def _heads(self) -> list[tuple[MapRow, Cursor]]:
         try:
-            return self._store.maps()
+            return self._store.heads()
         except CairnError as exc:
             log.info("views cannot be made ahead now: %s", exc.message)
         except Exception:
@@ -78,7 +79,7 @@ class ViewPrefetch:
         """Make the views of the cells that changed since the last look."""
         depth = first_depth(row.geometry.depth)
         with self._store.snapshot(row) as snapshot:
-            cursor = snapshot.head.cursor
+            cursor = snapshot.head
             seen = self._seen.get(row.number)
             if seen == cursor:
                 return

@@ -14,19 +14,35 @@ from cairn_map.commits.ids import CommitId
 from cairn_map.errors import BadInputError, NotFoundError
 from cairn_map.evidence.channels import Channel
 from cairn_map.evidence.evidence import Evidence
-from cairn_map.evidence.grid import CellKey, Geometry, cell_key, centres_of_voxels, split_voxels
+from cairn_map.evidence.grid import CellKey, Geometry, cell_key, centres_of_voxels, split_voxels, voxels_of_points
 from cairn_map.evidence.voxels import Reading, voxels_of_evidence
 from cairn_map.wire.messages import LogEntry
 from cairn_map.wire.voxel_messages import ChannelReading, VoxelAnswer, VoxelCommit
+from cairn_server.cell_room import DECODING, voxels_of
 from cairn_server.folding.cells import Cells
 from cairn_server.folding.cells_at_rest import decode_stored, sound_cell, stored_evidence
-from cairn_server.folding.decoding_room import DECODING, voxels_of
 from cairn_server.store.store import Snapshot, Store
 from cairn_server.store.store_rows import MapRow
 
 ENTRIES_MAX = 32
 """Most of the cell's newest log entries that are decoded, some 10 ms each."""
 VOXEL = re.compile(r"(0|-?[1-9]\d{0,9}),(0|-?[1-9]\d{0,9}),(0|-?[1-9]\d{0,9})")
+
+
+POINT = re.compile(r",".join([r"(-?[0-9]{1,9}(?:\.[0-9]{1,15})?)"] * 3))
+
+
+def voxel_at(geometry: Geometry, text: str) -> str:
+    """The voxel `i,j,k` that a point `x,y,z` in metres lies in.
+
+    Raises:
+        BadInputError: kind `bad_point`; `cell_range`: it lies beyond the numbered space.
+    """
+    found = POINT.fullmatch(text)
+    if found is None:
+        raise BadInputError("bad_point", f"a point is x,y,z in metres, as decimals, got {text[:60]!r}")
+    voxel = voxels_of_points(np.array([float(word) for word in found.groups()]), geometry)[0]
+    return ",".join(map(str, voxel.tolist()))
 
 
 def asked_voxel(store: Store, cells: Cells, row: MapRow, text: str) -> VoxelAnswer:
@@ -49,7 +65,7 @@ def asked_voxel(store: Store, cells: Cells, row: MapRow, text: str) -> VoxelAnsw
         if stored is None:
             raise NotFoundError("no_cell", f"no robot has seen cell {','.join(map(str, cell))} of map {row.name}")
         commits, more = _commits(snapshot, key, place, row.geometry)
-        cursor = snapshot.head.cursor
+        cursor = snapshot.head
     with DECODING.of_cell(row.geometry, stored.voxels):
         seen = _only(stored_evidence(stored), place)
     voxels = voxels_of_evidence(key, seen, row.geometry, row.sensor_model, occupied_only=False)

@@ -2,14 +2,16 @@ import json
 from pathlib import Path
 
 import pytest
-from tests.fixtures.client.live_server import LiveServer
+from tests.fixtures.client.live_server import MAP, LiveServer
 from tests.fixtures.client.made import A, opened, seen
 from tests.fixtures.server.live import Live
 
 from cairn_client.cli.doctor import main
-from cairn_client.cli.doctor_checks import CheckResult, clock_check
+from cairn_client.cli.doctor_checks import CheckResult, clock_check, grid_check
 from cairn_client.folders.map_copy import clone
+from cairn_client.http.api import MapApi
 from cairn_client.robot.robot import Robot
+from cairn_map.evidence.grid import geometry_for
 
 
 def told(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, dict[str, dict[str, str]]]:
@@ -95,3 +97,23 @@ def test_a_token_that_is_not_good_fails(tmp_path: Path, capsys: pytest.CaptureFi
 )
 def test_clocks_may_differ_by_seconds_but_not_by_hours(offset_s: float | None, verdict: CheckResult) -> None:
     assert clock_check(offset_s, 0.01).verdict is verdict
+
+
+def test_clocks_that_differ_by_less_than_is_measured_agree() -> None:
+    """A server on the same machine had "-0.4 s from ours": the seconds of its Date are whole."""
+    assert clock_check(-0.9, 0.01).found == "the server's agrees with ours, to within 1.0 s"
+    assert "+1.2 s from ours, to within 1.0 s" in clock_check(1.2, 0.01).found
+
+
+def test_a_folders_grid_is_compared_with_its_maps(
+    server: LiveServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A map made anew under the same name has another grid: the robot's waiting commits do not fit it."""
+    clone(server.map_url, tmp_path / "copy", token=None)
+    code, checks = told(capsys, str(tmp_path / "copy"))
+    assert (code, checks["grid"]["verdict"]) == (0, "ok")
+    with MapApi(server.url) as api:
+        found = grid_check(api, MAP, geometry_for(voxel_edge_m=0.5))
+    assert found.verdict is CheckResult.FAIL
+    assert "the folder has voxels of 0.5 m" in found.found
+    assert "keep the folder" in found.advice

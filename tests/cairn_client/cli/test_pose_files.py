@@ -5,15 +5,17 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from tests.fixtures.fusion import pose_forms
 from tests.fixtures.fusion.bags import ALL_CHANNELS, mapping_text, poses_of, recorded, small_recording, write_bag
 from tests.fixtures.fusion.pose_forms import FORMS, Writer, image_name, words
 
 from cairn_calib.rig.camera import Camera
-from cairn_calib.rig.poses import Transform
+from cairn_calib.rig.poses import Transform, quaternion_from_transform
 from cairn_client.cli.robots.command import main
 from cairn_client.robot.robot import Robot
+from cairn_fusion.recording.images import write_colour
 from cairn_fusion.recording.recording import Recording
 from cairn_map.codec.cell_code import encode_cell
 from cairn_map.errors import BadInputError
@@ -254,3 +256,98 @@ def test_rounded_rotations_are_said_for_pose_files_too(
     options = pose_forms.kitti(folder, [np.round(T, 4) for T in truth(source)])
     replay(folder, tmp_path / "state", *frame_options(source), *options)
     assert "poses were no exact rotations" in capsys.readouterr().out
+
+
+# --- layouts as publishers lay them out: folders by name, names that are times
+
+
+@pytest.mark.parametrize(("depth", "colour", "name"), [("Depth", "RGB", "{n}"), ("depth", "color", "frame-{n:06d}")])
+def test_folders_are_taken_by_their_names(
+    depth: str, colour: str, name: str, source: Recording, expected: dict[int, bytes], tmp_path: Path
+) -> None:
+    root = tmp_path / "set"
+    for n, entry in enumerate(source.files):
+        for folder in (depth, colour):
+            (root / folder).mkdir(parents=True, exist_ok=True)
+            shutil.copy(entry.range_path, root / folder / f"{name.format(n=n)}.png")
+        write_colour(root / colour / f"{name.format(n=n)}.png", grey_like(source, n))
+    poses = pose_forms.kitti(tmp_path, truth(source))
+    with pytest.raises(BadInputError, match=rf"{depth}/.*without intrinsics and poses: give --intrinsics"):
+        replay(root, tmp_path / "refused", *poses)
+    options = [word for word in frame_options(source) if word not in ("--depth", "{id}.png")]
+    cells = replay(root, tmp_path / "state", *options, *poses)
+    assert cells.keys() == expected.keys()
+    with Robot(None, SILENT, directory=tmp_path / "state", name="robot") as robot:
+        assert "colour" in {channel.name for channel in robot.replica.geometry.channels}
+
+
+def test_images_whose_names_are_times_go_with_the_nearest_depth_image(
+    source: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As TUM publishes RGB-D: two cameras, each with times of its own."""
+    root = tmp_path / "tum"
+    (root / "depth").mkdir(parents=True)
+    (root / "rgb").mkdir()
+    rows = []
+    for n, (entry, T) in enumerate(zip(source.files, truth(source), strict=True)):
+        time_s = 1305031102.16 + n / 30
+        shutil.copy(entry.range_path, root / "depth" / f"{time_s:.6f}.png")
+        if n != 2:
+            write_colour(root / "rgb" / f"{time_s + 0.008:.6f}.png", grey_like(source, n))
+        rows.append([round(time_s, 6), *T[:3, 3], *quaternion_from_transform(T)])
+    (root / "groundtruth.txt").write_text("".join(f"{words(row)}\n" for row in rows))
+    options = [word for word in frame_options(source) if word not in ("--depth", "{id}.png")]
+    replay(root, tmp_path / "state", *options, "--poses", str(root / "groundtruth.txt"))
+    said = capsys.readouterr().out
+    assert "images: colour rgb/{id}.png, depth depth/{id}.png" in said
+    assert "rgb/{id}.png: of each frame the image nearest in time, at most 0.02 s away; 1 of 4 frames have none" in said
+
+
+def grey_like(source: Recording, n: int) -> npt.NDArray[np.uint8]:
+    camera = source.rig[source.files[n].range_camera].camera
+    return np.full((camera.height, camera.width, 3), 40 * n + 50, np.uint8)
+
+
+# --- poses that are a source's own: taken as they are, and doubted
+
+
+def with_own_poses(source: Recording, folder: Path, poses: Sequence[Transform]) -> tuple[str, ...]:
+    for n, T in enumerate(poses):
+        (folder / f"{image_name(n)}.pose.txt").write_text(words(T))
+    return (*frame_options(source), "--pose", "{id}.pose.txt")
+
+
+@pytest.mark.parametrize(
+    ("change", "doubt"),
+    [
+        (lambda n, t: t + (60.0 if n == 2 else 0.0), "2 steps that no robot makes; the first: 1"),
+        (lambda n, t: t + 4000.0 * n, "the poses span 2.078e+04 m in all"),
+        (lambda n, t: t[:1] * 0 + 0.001 * n, "the poses span 0.005"),
+        (lambda n, t: t, ""),
+    ],
+    ids=["jump", "far", "small", "sound"],
+)
+def test_own_poses_that_no_robot_has_are_doubted(
+    change: Callable[[int, npt.NDArray[np.float64]], npt.NDArray[np.float64]],
+    doubt: str,
+    source: Recording,
+    folder: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    poses = truth(source)
+    for n, T in enumerate(poses):
+        T[:3, 3] = change(n, T[:3, 3].copy())
+    replay(folder, tmp_path / "state", *with_own_poses(source, folder, poses))
+    said = [line for line in capsys.readouterr().out.splitlines() if line.startswith("doubt: ")]
+    of_way = [line for line in said if "neighbouring" not in line and "points fall" not in line]
+    assert any(doubt in line for line in of_way) if doubt else of_way == []
+
+
+def test_ranges_of_another_unit_are_doubted(
+    source: Recording, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = list(with_own_poses(source, folder, truth(source)))
+    options[options.index("--depth-units") + 1] = "1000000"
+    replay(folder, tmp_path / "state", *options)
+    assert "is their unit right (--depth-units of a folder of frames)?" in capsys.readouterr().out

@@ -14,6 +14,7 @@ from tests.fixtures.client.made import GEOMETRY, seen
 
 from cairn_client.cli.maps.create import push_prior_data
 from cairn_client.http.api import MapApi
+from cairn_client.main import main
 from cairn_map.codec.cell_code import encode_cell
 from cairn_map.errors import BadInputError, CairnError, DamagedDataError, NotFoundError
 from cairn_map.evidence.evidence import packed_evidence
@@ -154,6 +155,20 @@ def test_evidence_that_no_server_takes_leaves_no_map(tmp_path: Path, api: MapApi
     less = packed_evidence(np.array([3], np.uint32), np.array([[-1, 0]]), np.zeros((1, 3), np.int64), GEOMETRY)
     write_cell(folder, CELLS[-1], encode_cell(cell_key(CELLS[-1]), less, GEOMETRY).data)
     assert check_all_or_none(folder, api) is not None
+
+
+def test_a_grid_beside_a_source_is_that_of_the_source_or_refused_with_both(
+    tmp_path: Path, api: MapApi, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, name = write_folder(tmp_path), f"map{next(NAMES)}"
+    create = ["map", "create", f"{api.origin}/maps/{name}", "--from", str(folder)]
+    for asked in (["--voxel", "0.02"], ["--channels", ""]):
+        assert main([*create, *asked]) == 1
+        assert f"the source of --from has {GEOMETRY}" in capsys.readouterr().err
+    with pytest.raises(NotFoundError):
+        api.map_info(name)
+    assert main([*create, "--voxel", f"{GEOMETRY.voxel_edge_m}"]) == 0
+    assert api.map_info(name).geometry == GEOMETRY
 
 
 def test_other_files_of_a_folder_are_left_alone(tmp_path: Path, api: MapApi) -> None:

@@ -1,22 +1,30 @@
 """`cairn map query` as a user types it: cells or a robot's state, words for people and JSON for programs."""
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from tests.fixtures.client.live_server import MAP, LiveServer
 from tests.fixtures.client.made import GEOMETRY, A, opened
 
 from cairn_client.cli.maps.command import main
 from cairn_client.folders.map_folder import open_map
+from cairn_client.http.api import MapApi
+from cairn_client.replica.outbox import CommitFacts
+from cairn_client.robot.robot import Robot
+from cairn_fusion.mapping.measurement import scan_pose
 from cairn_map.codec.cell_code import encode_cell
 from cairn_map.errors import BadInputError, ConflictError, DamagedDataError
 from cairn_map.evidence.evidence import Evidence, packed_evidence
 from cairn_map.evidence.grid import cell_of_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.files.cell_folder import FolderHead, write_cell, write_head
+from cairn_map.wire.messages import CreateMap
 
+Place = Path | str
 # Voxels of 5 cm: 0 is at the origin, 7 is the upper corner of its 2^3 block.
 HOT_K = 330.0
 
@@ -29,9 +37,30 @@ def evidence() -> Evidence:
     return packed_evidence(np.array([0, 4, 7], np.uint32), counts, samples, GEOMETRY)
 
 
-@pytest.fixture(params=["cells", "robot"])
-def folder(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """The same map on a server."""
+    root = tmp_path_factory.mktemp("server")
+    server = LiveServer(root / "data")
+    try:
+        with MapApi(server.url) as api:
+            api.create_map(MAP, CreateMap(geometry=GEOMETRY))
+        # As many counts as scans.
+        scans = tuple(scan_pose(float(n), np.eye(4)) for n in range(4))
+        with Robot(None, server.map_url, directory=root / "mole", name="mole") as robot:
+            robot.replica.commit({A: evidence()}, CommitFacts(scans=scans))
+            robot.sync()
+            server.wait_for_fold()
+        yield server.map_url
+    finally:
+        server.stop()
+
+
+@pytest.fixture(params=["cells", "robot", "url"])
+def folder(request: pytest.FixtureRequest, tmp_path: Path) -> Place:
     path = tmp_path / "lab"
+    if request.param == "url":
+        return str(request.getfixturevalue("url"))
     if request.param == "robot":
         replica = opened(path)
         replica.commit({A: evidence()})
@@ -42,16 +71,16 @@ def folder(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     return path
 
 
-def asked(capsys: pytest.CaptureFixture[str], folder: Path, *words: str) -> str:
+def asked(capsys: pytest.CaptureFixture[str], folder: Place, *words: str) -> str:
     assert main(["query", str(folder), *words]) == 0
     return capsys.readouterr().out
 
 
-def answered(capsys: pytest.CaptureFixture[str], folder: Path, *words: str) -> Any:
+def answered(capsys: pytest.CaptureFixture[str], folder: Place, *words: str) -> Any:
     return json.loads(asked(capsys, folder, *words, "--json"))
 
 
-def test_points_tell_state_probability_and_readings(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_points_tell_state_probability_and_readings(folder: Place, capsys: pytest.CaptureFixture[str]) -> None:
     points = ["0.01,0.01,0.01", "0.06,0.06,0.06", "-0.3,0,0"]
     free, hot, unknown = answered(capsys, folder, "points", *points)
     assert (free["state"], hot["state"], unknown["state"]) == ("free", "occupied", "unknown")
@@ -72,24 +101,28 @@ def test_points_tell_state_probability_and_readings(folder: Path, capsys: pytest
     assert lines[2].split() == ["-0.300", "0.000", "0.000", "unknown", "-", "-", "-", "-"]
 
 
-def test_a_ray_tells_how_far_it_comes(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_ray_tells_how_far_it_comes(folder: Place, capsys: pytest.CaptureFixture[str]) -> None:
     found = answered(capsys, folder, "ray", "0.02,0.02,-1", "0,0,1")
-    assert found == {"hit": True, "distance_m": pytest.approx(1.05), "voxel": [0, 0, 1]}
-    assert asked(capsys, folder, "ray", "0.02,0.02,-1", "0,0,2") == "occupied after 1.050 m\n"
+    place = pytest.approx([0.02, 0.02, 0.05])
+    assert found == {"hit": True, "distance_m": pytest.approx(1.05), "voxel": [0, 0, 1], "point_m": place}
+    said = "occupied after 1.050 m, at (0.020, 0.020, 0.050)\n"
+    assert asked(capsys, folder, "ray", "0.02,0.02,-1", "0,0,2") == said
     assert asked(capsys, folder, "ray", "0,0,-1", "0,0,-1") == "nothing is in the way as far as the map goes\n"
     assert asked(capsys, folder, "ray", "0,0,-1", "0,0,1", "--range", "0.5") == "nothing is in the way within 0.5 m\n"
 
 
-def test_the_nearest_occupied_and_unknown_voxels(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_nearest_occupied_and_unknown_voxels(folder: Place, capsys: pytest.CaptureFixture[str]) -> None:
     (found,) = answered(capsys, folder, "nearest", "0.025,0.025,-0.1")
     assert found["distance_m"] == pytest.approx(0.15)
-    assert answered(capsys, folder, "nearest", "9,9,9")[0]["distance_m"] is None
+    assert found["nearest_m"] == pytest.approx([0.025, 0.025, 0.05])
+    (far,) = answered(capsys, folder, "nearest", "9,9,9")
+    assert far["distance_m"] is far["nearest_m"] is None
     assert "none within 5 m" in asked(capsys, folder, "nearest", "9,9,9")
     assert "0.000 m to unknown space" in asked(capsys, folder, "nearest", "9,9,9", "--unknown")
 
 
 def test_the_hottest_voxels_in_kelvin_for_programs_and_celsius_for_people(
-    folder: Path, capsys: pytest.CaptureFixture[str]
+    folder: Place, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (found,) = answered(capsys, folder, "hottest")
     assert found["point_m"] == pytest.approx([0.075] * 3)
@@ -105,7 +138,7 @@ def test_the_hottest_voxels_in_kelvin_for_programs_and_celsius_for_people(
     assert elsewhere == "no occupied voxel has a temperature\n"
 
 
-def test_a_slice_is_drawn_for_people_and_listed_for_programs(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_slice_is_drawn_for_people_and_listed_for_programs(folder: Place, capsys: pytest.CaptureFixture[str]) -> None:
     found = answered(capsys, folder, "slice", "0.01")
     assert found["values"][0][:2] == [1, 0]
     assert found["edge_m"] == 0.05
@@ -118,7 +151,7 @@ def test_a_slice_is_drawn_for_people_and_listed_for_programs(folder: Path, capsy
     assert answered(capsys, folder, "slice", "0.01", "--what", "probability")["values"][0][1] is None
 
 
-def test_a_height_map_tells_the_highest_surfaces(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_height_map_tells_the_highest_surfaces(folder: Place, capsys: pytest.CaptureFixture[str]) -> None:
     found = answered(capsys, folder, "height", "--box=0,0,0,1,1,1")
     assert found["values"][0][0] == pytest.approx(0.1)
     assert found["values"][0][1] is None

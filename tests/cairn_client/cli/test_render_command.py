@@ -1,5 +1,6 @@
 """A robot without a thermal camera sees the temperatures that another one measured: through a server, by any door."""
 
+import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,12 +10,15 @@ import numpy as np
 import pytest
 from tests.fixtures.client.live_server import LiveServer
 
+from cairn_calib.rig.poses import inverse, transform_from_quaternion
 from cairn_client.cli.maps.command import main
 from cairn_client.cli.robots.telepresence import main as telepresence
 from cairn_client.folders.map_folder import ages_of
 from cairn_client.http.api import MapApi
 from cairn_client.robot.robot import Robot
 from cairn_fusion.image_fusion.surface import live_range
+from cairn_fusion.recording.trajectory import trajectory_line
+from cairn_fusion.recording.turned_source import rotation_up
 from cairn_fusion.view.overlay import Live, OverlayMode, OverlayStyle, draw_overlay
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.grid import geometry_for
@@ -127,6 +131,31 @@ def test_the_command_draws_over_a_recorded_image(
     wide = ",".join(["0.25" if n in (0, 2, 5) else "0" for n in range(21)])  # 0.5 rad about each axis
     assert main([*words, "--covariance", wide]) == 0
     assert "withheld" in capsys.readouterr().out
+
+
+def test_over_and_telepresence_take_what_replay_takes(world: World, tmp_path: Path) -> None:
+    """A recording whose poses are a file of a published form, in a world on its back."""
+    cells, bare = tmp_path / "cells", tmp_path / "bare"
+    main(["export", world.url, "--cells", str(cells)])
+    shutil.copytree(world.recording, bare)
+    rows = [line.split() for line in (bare / "trajectory.txt").read_text().splitlines() if not line.startswith("#")]
+    (bare / "trajectory.txt").unlink()
+    T_world_map = inverse(rotation_up("-y"))
+    with (tmp_path / "tum.txt").open("w") as file:
+        for time_s, *pose in rows:
+            T = T_world_map @ transform_from_quaternion([float(w) for w in pose[:3]], [float(w) for w in pose[3:]])
+            file.write(trajectory_line(float(time_s), T))
+    options = ["--poses", str(tmp_path / "tum.txt"), "--up", "-y"]
+    pictures = [tmp_path / f"{name}.png" for name in ("own", "over", "live")]
+    assert main(["render", str(cells), "--over", str(world.recording), "-o", str(pictures[0])]) == 0
+    assert main(["render", str(cells), "--over", str(bare), *options, "-o", str(pictures[1])]) == 0
+    asked = [str(bare), "--map", str(cells), "--mode", "map", "--scale", "10:50", "--scan", "0"]
+    assert telepresence([*asked, *options, "--output", str(pictures[2])]) == 0
+    own = rendered(pictures[0])
+    # Poses that were turned and turned back differ in their last bit, which may move single pixels of an edge.
+    assert all((rendered(one) != own).any(axis=2).mean() < 1e-3 for one in pictures[1:])
+    with pytest.raises(BadInputError, match="--up is about a recording: give --over RECORDING"):
+        main(["render", str(cells), "--from", "0,0,1", "--to", "1,1,1", "--up", "-y", "-o", str(pictures[0])])
 
 
 @pytest.mark.slow

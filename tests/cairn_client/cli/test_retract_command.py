@@ -1,8 +1,11 @@
 """Times as people write them, and a retract that is only looked at."""
 
+import json
 from datetime import UTC, datetime
+from pathlib import Path
 
 import pytest
+from tests.fixtures.client.robot_program import RIG
 from tests.fixtures.server.live import Live, live
 from tests.fixtures.server.pushes import MOLE, WREN, pushed, read, sum_of
 
@@ -50,3 +53,25 @@ def test_a_dry_run_names_the_commits_and_changes_nothing(live: Live, capsys: pyt
     assert main(wanted) == 0
     assert "takes out 2 commits" in capsys.readouterr().out
     assert read(live.cells(row)) == sum_of(commits[2:])
+
+
+def test_a_rig_is_named_by_its_file_however_that_is_laid_out_and_the_log_says_why(
+    live: Live, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    row, file = live.new_map(), tmp_path / "rig.json"
+    rig = json.loads(RIG.to_json())
+    file.write_text(json.dumps(dict(reversed(rig.items())), indent=4))
+    commits = [pushed(0, 0, rig=RIG.digest(), note="the lens \x1b[2Jwas dirty"), pushed(1, 1, rig="ab" * 32)]
+    for commit in commits:
+        live.push(row, commit)
+    url = f"http://127.0.0.1:{live.port}/maps/{row.name}"
+    assert main(["map", "retract", url, "--rig", str(file), "--note", "calibrated again"]) == 0
+    assert "takes out 1 commits" in capsys.readouterr().out
+    assert read(live.cells(row)) == sum_of(commits[1:])
+    for more in ([], ["--graph"]):
+        assert main(["map", "log", url, *more]) == 0
+        shown = capsys.readouterr().out
+        assert "was dirty'" in shown and shown.count("calibrated again") == 1
+        assert "\x1b" not in shown
+    assert main(["map", "retract", url, "--rig", "rig.jsn"]) == 1
+    assert "--rig takes a rig.json, or the 64 hex digits" in capsys.readouterr().err

@@ -20,7 +20,7 @@ from tests.fixtures.client.world import stored_commits
 
 from cairn_client import main as cairn
 from cairn_client.cli.robots.run import _commit, _map_what_came, _Tally
-from cairn_client.folders.spool import Spool, remember
+from cairn_client.folders.spool import Mark, Spool, remember
 from cairn_fusion.mapping.integrate import integrate_scan
 from cairn_fusion.recording.recording import open_recording
 from cairn_fusion.recording.recording_writer import RecordingWriter
@@ -171,11 +171,28 @@ def test_a_spool_is_read_in_order_and_only_what_is_whole_and_sound(spool: Path, 
         record(spool, "d", [4])
         (spool / "d" / "tof.txt").write_text("nonsense")
         record(spool, "e", [5]).joinpath("recording.json").unlink()
-        found = [(stop.folder.name, stop.number) for stop in watched.stops(mole.replica)]
+        found = [(stop.folder.name, stop.scans.start) for stop in watched.stops(mole.replica)]
         assert found == [("a", 0), ("a", 1), ("b", 0)]
         again = Spool(spool)
         remember(mole.replica, next(iter(again.stops(mole.replica))).mark())
-        assert [(stop.folder.name, stop.number) for stop in again.stops(mole.replica)] == [("a", 1), ("b", 0)]
+        assert [(stop.folder.name, stop.scans.start) for stop in again.stops(mole.replica)] == [("a", 1), ("b", 0)]
+
+
+def test_scans_that_nobody_grouped_are_grouped_and_go_on_where_a_mark_of_single_scans_ended(
+    spool: Path, tmp_path: Path
+) -> None:
+    """A mark from before counted measurements of one scan each: the same number counts scans."""
+    record(spool, "a", list(range(1, 6)))
+    (spool / "a" / "measurements.txt").unlink()
+    with robot_in(tmp_path) as mole:
+        (stop,) = Spool(spool).stops(mole.replica)
+        assert stop.scans == range(5)
+        first_s = stop.source.files[0].time_s
+        remember(mole.replica, {"spool/a": Mark(first_s=first_s, stops=2, is_done=False).model_dump_json()})
+        (stop,) = Spool(spool).stops(mole.replica)
+        assert stop.scans == range(2, 5)
+        remember(mole.replica, stop.mark())
+        assert list(Spool(spool).stops(mole.replica)) == []
 
 
 def test_another_recording_under_an_old_name_is_mapped(spool: Path, tmp_path: Path) -> None:
@@ -259,7 +276,7 @@ def test_a_measurement_that_no_commit_can_be_made_of_stops_nothing(
         args, tally = argparse.Namespace(profile="fast", delete=True), _Tally()
         _map_what_came(mole, Spool(spool), args, tally, threading.Event())
         assert (tally.commits, mole.waiting) == (2, 2)
-        assert "measurement 0 of" in caplog.text and "256 MiB at most" in caplog.text
+        assert "scans 0 to 0 of" in caplog.text and "256 MiB at most" in caplog.text
         assert [path.name for path in spool.iterdir()] == ["a"]  # it is not deleted: not all of it is mapped
         assert list(Spool(spool).stops(mole.replica)) == []  # after a restart
 

@@ -14,8 +14,8 @@ from tests.fixtures.server.live import Live
 
 from cairn_client.cli.robots import telepresence as telepresence_command
 from cairn_client.cli.robots.telepresence import main, publish_views
+from cairn_client.cli.source_arguments import asked_source
 from cairn_client.http.api import MapApi
-from cairn_fusion.importers import open_source
 from cairn_fusion.recording.images import read_colour
 from cairn_fusion.recording.recording import ScanSource
 from cairn_fusion.recording.scan import Scan
@@ -155,9 +155,9 @@ def gaps(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     missing: list[int] = []
 
     def opened(*args: Any, **options: Any) -> WithGaps:
-        return WithGaps(open_source(*args, **options), missing)
+        return WithGaps(asked_source(*args, **options), missing)
 
-    monkeypatch.setattr(telepresence_command, "open_source", opened)
+    monkeypatch.setattr(telepresence_command, "asked_source", opened)
     return missing
 
 

@@ -80,3 +80,11 @@ def test_what_a_robot_says_of_itself_stays_within_its_line() -> None:
     )
     assert all(len(line.splitlines()) == 1 and len(line) < 200 for line in branch_table([branch]))
     assert shown_text(one_line(status.note)) == one_line(status.note)
+
+
+@pytest.mark.parametrize(
+    "hidden", ["\x1b", "\x9b", "\u202e", "\u061c", "\u200b", "\ufeff", "\U000e0041", "\ue000", "\u00ad"]
+)
+def test_what_steers_or_does_not_show_is_replaced(hidden: str) -> None:
+    assert shown_text(f"mole{hidden} \té\n") == "mole\N{REPLACEMENT CHARACTER} \té\n"
+    assert shown_text("Grüße, 地図, 21 °C 👋") == "Grüße, 地図, 21 °C 👋"

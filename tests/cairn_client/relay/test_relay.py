@@ -149,7 +149,7 @@ def test_a_field_server_forgets_nothing_that_its_upstream_has_not_got(base: Serv
 
         def is_gone() -> bool:
             field.service._fold_thread._forget_next_s = 0.0
-            assert not field.service._fold_thread._forget_old([field.row])
+            assert not field.service._fold_thread._forget_old()
             found = field.service.store.commit(field.row, commit)
             return found is not None and found.gone
 

@@ -20,14 +20,15 @@ from tests.fixtures.client.made import (
     seen,
 )
 
+from cairn_client.replica import outbox
 from cairn_client.replica.outbox import CommitFacts
 from cairn_client.replica.replica import Replica
-from cairn_map.commits.commit import Commit, CommitMeta, make_commit
+from cairn_map.commits.commit import Commit, CommitMeta, make_commit, split_commit
 from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.ids import CommitId
 from cairn_map.commits.version_vector import EMPTY, VersionVector
 from cairn_map.evidence.evidence import Evidence
-from cairn_map.evidence.grid import CellKey
+from cairn_map.evidence.grid import CellKey, cell_key
 from cairn_map.wire.frames import FrameKind
 
 C1, C2, C3 = cursor(1), cursor(2), cursor(3)
@@ -150,3 +151,31 @@ def test_a_commit_and_its_amend_may_both_get_new_ids(mole: Replica) -> None:
     mole.acknowledge(renamed)
     at(mole, C1, added(W, X), covering(wrong.id, amend.id, renamed))  # the old ids are other commits on the server
     assert mole.view.evidence(A) == added(W, Y)
+
+
+def test_a_folder_whose_commit_has_many_cells_is_opened_by_reading_the_commit_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Cell by cell, one commit of 2132 cells took 18 s to open."""
+    mole = opened(tmp_path / "mole")
+    cells = [cell_key((n, 0, 0)) for n in range(60)]
+    mole.commit(dict.fromkeys(cells, X))
+    mole.close()
+    reads = []
+
+    def counted(data: bytes) -> tuple[CommitMeta, dict[CellKey, bytes]]:
+        reads.append(len(data))
+        return split_commit(data)
+
+    monkeypatch.setattr(outbox, "split_commit", counted)
+    again = opened(tmp_path / "mole")
+    assert all(again.view.evidence(key) == X for key in cells)
+    assert len(reads) <= 2
+    # Commits that together are larger than what stays in memory are read again, and right.
+    monkeypatch.setattr(outbox, "READ_LAST_BYTES_MAX", 1)
+    again.commit(dict.fromkeys(cells, Y))
+    again.close()
+    last = opened(tmp_path / "mole")
+    assert all(last.view.evidence(key) == added(X, Y) for key in cells)
+    assert len(reads) > 60
+    last.close()

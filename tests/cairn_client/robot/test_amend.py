@@ -13,7 +13,7 @@ from tests.fixtures.client.world import stored_commits
 
 from cairn_calib.rig.poses import Transform, look_at
 from cairn_client.replica.limits import Limits
-from cairn_client.robot.kept_scans import OPEN
+from cairn_client.robot.kept_scans import OPEN, KeptScans
 from cairn_client.robot.robot import Robot
 from cairn_fusion.mapping.integrate import integrate_scan
 from cairn_fusion.recording.scan import Scan
@@ -168,6 +168,41 @@ def test_commits_leave_the_robot_when_their_scans_did(server: LiveServer, tmp_pa
         assert 0 < len(kept) < len(commits)
 
 
+def test_a_replaced_commit_stays_hidden_when_the_amends_bytes_have_gone_first(
+    server: LiveServer, tmp_path: Path
+) -> None:
+    """Pushed together, they leave cells that the server never had: there the first commit's bytes stay, and showed."""
+    limits = Limits(disk_bytes_max=1_000_000, keep_acked_s=0)
+    with robot_in(tmp_path, server.map_url, limits=limits) as robot:
+        amend = robot.amend(measured(robot, 1), poses_of(corrected(1)))
+        for _ in range(3):
+            robot.sync()
+            server.wait_for_fold()
+        assert amend.id not in robot.replica.commits
+    with robot_in(tmp_path, server.map_url) as robot:
+        assert cells_of(robot.map) == cells_of(sum_of(corrected(1)))
+
+
+def test_a_kill_between_an_amend_and_its_note_on_the_scans_leaves_them_to_amend(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def killed(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with robot_in(tmp_path) as robot:
+        commit = measured(robot, 1)
+        monkeypatch.setattr(KeptScans, "rename", killed)
+        for seed in (3, 4):
+            with pytest.raises(KeyboardInterrupt):
+                robot.amend(commit, T_map_observed=drift(seed))
+        monkeypatch.undo()
+    with robot_in(tmp_path) as robot:
+        robot.amend(commit, poses_of(corrected(1)))
+        assert cells_of(robot.map) == cells_of(sum_of(corrected(1)))
+        robot.retract(commit)
+        refused_amend(robot, commit, "taken_back")
+
+
 def test_the_open_measurement_stays_open(tmp_path: Path) -> None:
     with robot_in(tmp_path) as robot:
         commit = measured(robot, 1)
@@ -221,7 +256,7 @@ def test_a_robot_that_keeps_no_scans_says_so(tmp_path: Path) -> None:
 
 def test_a_measurement_larger_than_the_buffer_is_mapped_all_the_same(tmp_path: Path) -> None:
     with robot_in(tmp_path, keep_scans_bytes=900) as robot:
-        refused_amend(robot, measured(robot, *range(1, 12)), "no_scans")
+        assert "they alone are larger" in refused_amend(robot, measured(robot, *range(1, 12)), "no_scans")
         assert cells_of(robot.map) == cells_of(sum_of([scan_of(seed) for seed in range(1, 12)]))
         robot.amend(measured(robot, 20), poses_of(corrected(20)))
 
@@ -229,7 +264,7 @@ def test_a_measurement_larger_than_the_buffer_is_mapped_all_the_same(tmp_path: P
 def test_a_disk_that_takes_no_scans_costs_no_evidence(tmp_path: Path) -> None:
     with robot_in(tmp_path) as robot:
         (tmp_path / "mole/scans").write_text("a file")
-        refused_amend(robot, measured(robot, 1, 2), "no_scans")
+        assert "the disk did not take them" in refused_amend(robot, measured(robot, 1, 2), "no_scans")
         assert cells_of(robot.map) == cells_of(sum_of([scan_of(1), scan_of(2)]))
 
 
@@ -295,3 +330,13 @@ def test_a_robot_without_a_rig_amends_nothing(tmp_path: Path) -> None:
         commit = measured(robot, 1)
     with Robot(None, NOWHERE, directory=tmp_path / "mole", name="mole", geometry=GEOMETRY) as robot:
         refused_amend(robot, commit, "no_rig")
+
+
+def test_what_was_never_measured_here_is_told_as_such(tmp_path: Path) -> None:
+    """Both were "not kept: older ones went"."""
+    with robot_in(tmp_path) as robot:
+        commit = measured(robot, 1)
+        unknown = str(commit.id).rpartition(".")[0] + ".77"
+        assert "this folder knows no such commit" in refused_amend(robot, unknown, "no_scans")
+        others = str(commit.id).replace("mole.", "wren.")
+        assert "it is wren's, and this robot, mole, amends its own alone" in refused_amend(robot, others, "no_scans")

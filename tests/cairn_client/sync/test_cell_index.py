@@ -17,7 +17,7 @@ from cairn_client.sync.sync import fetch_cells
 from cairn_map.commits.ids import Author
 from cairn_map.errors import UnreachableError
 from cairn_map.evidence.grid import Cell, CellKey, cell_key, cell_of_key
-from cairn_map.wire.messages import CellEntry, CellIndex, Retract
+from cairn_map.wire.messages import CellEntry, CellIndex, ReplyHeader, Retract
 
 PAGE = 2
 KEYS = sorted(cell_key((i, 0, 0)) for i in range(-3, 4))
@@ -45,13 +45,19 @@ class Between(MapApi):
         self.pages = 0
 
     def cell_index(
-        self, name: str, author: Author | None = None, *, box: Box | None = None, after: Cell | None = None
+        self,
+        name: str,
+        author: Author | None = None,
+        *,
+        box: Box | None = None,
+        after: Cell | None = None,
+        held: ReplyHeader | None = None,
     ) -> CellIndex:
         if self.pages == self._page:
             self._team["mole"].commit({key: seen(9) for key in self._changed})
             self._team.push("mole")
         self.pages += 1
-        found = super().cell_index(name, author, box=box, after=after)
+        found = super().cell_index(name, author, box=box, after=after, held=held)
         assert len(found.cells) <= PAGE
         return found
 
@@ -98,12 +104,18 @@ def test_a_cell_that_became_again_what_it_was_stands_where_it_became_so(team: Te
 
     class Retracted(Between):
         def cell_index(
-            self, name: str, author: Author | None = None, *, box: Box | None = None, after: Cell | None = None
+            self,
+            name: str,
+            author: Author | None = None,
+            *,
+            box: Box | None = None,
+            after: Cell | None = None,
+            held: ReplyHeader | None = None,
         ) -> CellIndex:
             if self.pages == 1:
                 self.retract(name, Retract(commits=[str(wrong.id)]))
                 team.server.wait_for_fold()
-            return super().cell_index(name, author, box=box, after=after)
+            return super().cell_index(name, author, box=box, after=after, held=held)
 
     with Retracted(team, [], page=-1) as api:
         api.token = None
@@ -120,7 +132,13 @@ class Replaced:
     """A server that was restored between two pages."""
 
     def cell_index(
-        self, name: str, author: Author | None = None, *, box: Box | None = None, after: Cell | None = None
+        self,
+        name: str,
+        author: Author | None = None,
+        *,
+        box: Box | None = None,
+        after: Cell | None = None,
+        held: ReplyHeader | None = None,
     ) -> CellIndex:
         cells = [
             CellEntry(cell=cell_of_key(key), size_bytes=1, digest="0" * 64, lm=1, fingerprint="0" * 32, voxels=1)

@@ -9,6 +9,7 @@ from tests.fixtures.client.live_server import LiveServer
 from tests.fixtures.client.made import A, B, cells_of, flip_a_bit, seen
 from tests.fixtures.client.robots import evidence_of, map_commit, robot_in
 from tests.fixtures.client.team import Team
+from tests.fixtures.server.stores import KIND
 
 from cairn_client.cli.robots import replay as replay_command
 from cairn_client.http.api import MapApi
@@ -42,6 +43,8 @@ def change(server: LiveServer, statement: str) -> None:
     """The same for a whole column."""
     server.stop()
     (database,) = server.settings.folder.glob("*.sqlite")
+    if KIND != "sqlite":
+        pytest.skip("writes into SQLite's file")
     connection = sqlite3.connect(database)
     connection.execute(statement)
     connection.commit()

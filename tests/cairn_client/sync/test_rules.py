@@ -510,7 +510,7 @@ class Cells:
         self.index_digest = self.digest
         self.asked = 0
 
-    def cell_index(self, name: str, author: object = None, *, box: object = None, after: object = None) -> CellIndex:
+    def cell_index(self, name: str, author: object = None, **more: object) -> CellIndex:
         entry = CellEntry(
             cell=cell_of_key(A),
             size_bytes=1,

@@ -12,7 +12,16 @@ from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.lidar import SpinningLidar
 from cairn_calib.rig.poses import look_at
 from cairn_calib.rig.rig import RangeSensing, Rig, Spectrum, mount_camera
-from cairn_fusion.mapping.clear_kernels import EDGE_STEP_M, GRAZING_MAX, GRAZING_SHARE, SLANT_SHARE, nearest_around
+from cairn_fusion.mapping.clear_kernels import (
+    BRIDGE_STEP_M,
+    EDGE_STEP_M,
+    GAP_PX,
+    GRAZING_MAX,
+    GRAZING_SHARE,
+    SLANT_SHARE,
+    bridge_gaps_into,
+    nearest_around,
+)
 from cairn_fusion.mapping.integrate import Integration, Integrator, Method, integrate_scan
 from cairn_fusion.recording.scan import Scan
 from cairn_map.evidence.channels import INTENSITY
@@ -28,6 +37,7 @@ AHEAD = look_at((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
 """Looks along the map's x."""
 
 Floats = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
 Singles = npt.NDArray[np.float32]
 Diff = dict[CellKey, Evidence]
 
@@ -110,6 +120,74 @@ def test_what_is_nearest_agrees_with_its_slow_twin(seed: int) -> None:
         clear = np.maximum(nearest_m - share * margin_m(nearest_m), 0)
         np.testing.assert_allclose(clear, naive(*args, 4.0, focal_px), atol=1e-5)  # type: ignore[arg-type]
         assert (clear[np.isinf(seen_m)] > 0).any() and (clear[np.isnan(seen_m)] == 0).all()
+
+
+def naive_bridged(seen_m: Singles, missing: Flags) -> Singles:
+    """Rows, and then columns: each missing pixel with a known one at either end of a gap of at most `GAP_PX`."""
+    for _ in range(2):
+        bridged, width = seen_m.copy(), seen_m.shape[1]
+        for y, first in np.ndindex(seen_m.shape):
+            for end in range(first + 2, min(first + GAP_PX + 2, width)):
+                gap, ends_m = slice(first + 1, end), seen_m[y, [first, end]]
+                is_gap = missing[y, gap].all() and not (seen_m[y, gap] > 0).any()
+                if is_gap and (ends_m > 0).all() and abs(ends_m[0] - ends_m[1]) <= BRIDGE_STEP_M:
+                    bridged[y, gap] = ends_m.min()
+        seen_m, missing = bridged.T.copy(), missing.T
+    return seen_m
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_bridging_of_gaps_agrees_with_its_slow_twin(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    seen_m = rng.uniform(1.0, 4.0, (11, 17)).astype(np.float32)
+    seen_m[rng.random(seen_m.shape) < 0.15 * seed] = np.nan
+    missing = np.isnan(seen_m) & (rng.random(seen_m.shape) < 0.9)
+    shield_m = np.where(np.isnan(seen_m) & ~missing & (rng.random(seen_m.shape) < 0.5), np.float32(0.5), seen_m)
+    bridged, shields = seen_m.copy(), shield_m.copy()
+    bridge_gaps_into(bridged, shields, missing)
+    np.testing.assert_array_equal(bridged, naive_bridged(seen_m, missing))
+    filled = np.isnan(seen_m) & ~np.isnan(bridged)
+    np.testing.assert_array_equal(shields, np.where(filled, bridged, shield_m))
+    assert filled.any() == (seed > 0)
+
+
+def column_of(points: Floats) -> npt.NDArray[np.int64]:
+    """(N,) the image's column that each point falls on."""
+    columns: npt.NDArray[np.int64] = np.rint(19.5 - 60.0 * points[:, 1] / points[:, 0]).astype(np.int64)
+    return columns
+
+
+def test_an_image_with_gaps_between_its_pixels_clears_what_the_whole_one_clears() -> None:
+    gappy = wall(2.02)
+    gappy[::3], gappy[:, 1::3], gappy[:, 2::3] = np.nan, np.nan, np.nan
+    whole, bridged = ({tuple(p) for p in seen(integrated(scan_of(r), rig_of()), 1)} for r in (wall(2.02), gappy))
+    # The image's own rim has no pixel on its other side.
+    assert len(bridged) > 0.85 * len(whole) > 1000
+    assert len(bridged - whole) < 0.002 * len(whole)
+
+
+@pytest.mark.parametrize(
+    ("width", "near_m", "cleared"), [(1, 2.3, True), (2, 2.3, True), (3, 2.3, False), (2, 1.9, False)]
+)
+def test_a_gap_is_bridged_by_the_nearer_side_if_it_and_the_step_are_small(
+    width: int, near_m: float, cleared: bool
+) -> None:
+    range_m = wall(3.0)
+    range_m[:, :15] = wall(near_m)[:, :15]
+    range_m[:, 15 : 15 + width] = np.nan
+    free = seen(integrated(scan_of(range_m), rig_of()), 1)
+    within = free[(column_of(free) >= 15) & (column_of(free) < 15 + width)]
+    assert len(within) > 20 if cleared else len(within) == 0
+    assert not cleared or within[:, 0].max() < near_m
+
+
+@pytest.mark.parametrize("cause", ["full", "near", "far"])
+def test_a_pixel_that_saw_something_is_no_gap(cause: str) -> None:
+    range_m, amplitude = wall(3.0), np.full((30, 40), 500, np.uint16)
+    range_m[:, 15] = {"full": np.nan, "near": 0.02, "far": 9.0}[cause]
+    amplitude[:, 15] = 1000 if cause == "full" else 500
+    free = seen(integrated(scan_of(range_m, amplitude=amplitude), rig_of(saturated_amplitude=1000)), 1)
+    assert len(free) > 1000 and not (column_of(free) == 15).any()
 
 
 @pytest.mark.parametrize(("sigma_m", "k", "kept_m"), [(0.001, 2.0, EDGE_M), (0.1, 2.0, 0.2), (0.1, 0.0, EDGE_M)])

@@ -14,7 +14,7 @@ from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.poses import Transform, inverse, look_at, transform_points
 from cairn_calib.rig.rig import Rig, Spectrum, mount_camera
 from cairn_fusion.importers import open_source
-from cairn_fusion.mapping.integrate import Integrator, integrate_scan
+from cairn_fusion.mapping.integrate import Integrator, Method, integrate_scan, integrator_from_text
 from cairn_fusion.mapping.measurement import Measurement
 from cairn_fusion.recording.recording import Recording
 from cairn_fusion.recording.scan import Scan
@@ -389,6 +389,15 @@ def in_cups(
         is_there = np.abs(scan.range_m[y, x] - np.linalg.norm(points[seen], axis=1)) < 0.02
         found[seen] |= (labels[y, x] == HOT_CUP) & is_there
     return found
+
+
+def test_an_integrator_is_read_from_the_text_that_commits_state() -> None:
+    for integrator in (Integrator(), INTEGRATOR, Integrator(method=Method.CAST, max_range_m=7.25, noise_sigmas=0)):
+        assert integrator_from_text(str(integrator)) == integrator
+    older = "cairn-carve 4 min_range_m=0.2 max_range_m=usual"
+    assert integrator_from_text(older) == Integrator(min_range_m=0.2)
+    for foreign in ("", "other 1 min_range_m=0.2", "cairn-carve 6 min_range_m=near", "cairn-carve 6 min_range_m=-1"):
+        assert integrator_from_text(foreign) is None
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """Unordered points as evidence: what a lidar sees, real sweeps too."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from cairn_calib.rig.rig import Rig, Spectrum, mount_camera
 from cairn_fusion.mapping.beam_returns import returns_of
 from cairn_fusion.mapping.integrate import Integration, Integrator, Method, integrate_scan
 from cairn_fusion.mapping.measurement import Measurement
+from cairn_fusion.recording.scan_bytes import decode_scan, encode_scan, move_scan
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey, Geometry, geometry_for, voxels_in_cell
@@ -124,3 +126,27 @@ def test_two_real_sweeps_agree_with_the_true_pose_and_not_with_its_inverse(test_
 
     assert share(map_of(second, T)) >= 0.75
     assert share(map_of(second, inverse(T))) < 0.35
+
+
+def test_a_scan_of_points_means_what_its_points_mean_and_each_is_counted_once() -> None:
+    plain = rig_of(BARREL)
+    limits = Integrator(min_range_m=0.3, max_range_m=3.0)
+    points = np.random.default_rng(5).uniform(-2.5, 2.5, (500, 3)).astype(np.float32)
+    points[0], points[1], points[2], points[3] = np.nan, 0.0, (0.1, 0.1, 0.1), (9.0, 0.0, 0.0)
+    image = np.full((BARREL.height, BARREL.width), np.nan, np.float32)
+    scan = replace(random_scan(BARREL, 3), range_m=image, points_m=points, amplitude=None, colour={}, thermal={})
+    by_scan, by_points = Integration(plain, GEOMETRY, limits), Integration(plain, GEOMETRY, limits)
+    by_scan.add(scan)
+    by_points.add_points(points, scan.T_map_rig @ plain["tof"].transform, range_camera="tof")
+    assert by_scan.diff().keys() == by_points.diff().keys()
+    assert all(by_scan.diff()[key] == cell for key, cell in by_points.diff().items())
+    counts = by_scan.counts
+    assert (counts.pixels, counts.no_return, counts.too_near) == (500, 2, 1)
+    assert counts.too_far == int((np.linalg.norm(points[4:], axis=1) > 3.0).sum()) + 1
+    # Kept scans give the same bytes back, and a moved one takes its points along.
+    again = decode_scan(encode_scan(scan))
+    assert again.points_m is not None
+    assert again.points_m.tobytes() == points.tobytes()
+    assert move_scan(scan, np.eye(4)).points_m is points
+    with pytest.raises(BadInputError, match="float32, got float64 of shape"):
+        by_scan.add(replace(scan, points_m=points.astype(np.float64)))  # type: ignore[arg-type]

@@ -530,8 +530,9 @@ def test_a_value_that_16_bits_cannot_hold_is_refused_and_leaves_no_line(
         T_map_rig=np.eye(4),
         range_camera="tof",
         range_m=np.full(full, range_m, np.float32),
-        thermal={"ir": np.full(full, kelvin, np.float32)},
+        thermal={"ir": np.full(full, 300.0, np.float32)},
     )
+    scan.thermal["ir"][0, 0] = kelvin
     with RecordingWriter(tmp_path / "lab", RIG, name="lab") as recording:
         with pytest.raises(BadInputError) as caught:
             recording.add(scan)

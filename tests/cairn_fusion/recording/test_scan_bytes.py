@@ -1,13 +1,14 @@
 """Scans as bytes: the same scan again, bit for bit, or an error."""
 
 import dataclasses
+import io
 
 import numpy as np
 import pytest
 
 from cairn_calib.rig.poses import look_at
 from cairn_fusion.recording.scan import Scan
-from cairn_fusion.recording.scan_bytes import decode_scan, encode_scan, move_scan
+from cairn_fusion.recording.scan_bytes import decode_scan, encode_scan, move_scan, place_scan, read_images
 from cairn_map.errors import DamagedDataError
 
 
@@ -56,6 +57,23 @@ def test_a_scan_that_moves_nowhere_is_the_same(seed: int) -> None:
         before, after = (np.linalg.inv(s.T_map_rig) @ s.T_map_body for s in (scan, moved) if s.T_map_body is not None)
         assert np.allclose(before, after, atol=1e-12)
     assert bits(moved.range_m) == bits(scan.range_m)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_scan_is_placed_where_it_was_moved_to_bit_for_bit(seed: int) -> None:
+    scan = random_scan(seed)
+    moved = move_scan(scan, look_at([1, 2, 3], [3, 1, 1]))
+    assert bits_of(place_scan(scan, moved.T_map_rig)) == bits_of(moved)
+
+
+def test_the_images_of_a_scan_are_read_without_their_pixels() -> None:
+    scan = random_scan(2)
+    found = read_images(io.BytesIO(encode_scan(scan)))
+    assert found == read_images(io.BytesIO(encode_scan(move_scan(scan, look_at([1, 2, 3], [3, 1, 1])))))
+    assert ("range", "", scan.range_m.dtype.str, scan.range_m.shape) in found
+    for damaged in (b"", b"\1\0", b"\4\0\0\0{}[]", b"\2\0\0\0{}"):
+        with pytest.raises(DamagedDataError):
+            read_images(io.BytesIO(damaged))
 
 
 def test_damaged_bytes_are_refused() -> None:

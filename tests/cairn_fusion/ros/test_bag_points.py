@@ -6,22 +6,29 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rosbags.typesys import get_types_from_msg
 from tests.fixtures.fusion.bags import KINDS, ROS2, Messages, Timed, pose_of, write_bag
+from tests.fixtures.fusion.cloud_forms import beams, off_walls_m, pcd_binary, seen
+from tests.fixtures.fusion.cloud_forms import pose_of as room_pose
+from tests.fixtures.fusion.pose_forms import kitti
 
 from cairn_calib.rig.lidar import SpinningLidar
+from cairn_calib.rig.poses import Transform, transform_points
+from cairn_fusion.clouds.sweep_image import R_LIDAR_CAMERA, sweep_image
 from cairn_fusion.importers import open_source
+from cairn_fusion.mapping.measurement import Measurement
+from cairn_fusion.recording.frame_poses import PoseOptions
 from cairn_fusion.ros.bag import Wire
 from cairn_fusion.ros.bag_recording import survey
 from cairn_fusion.ros.point_clouds import (
-    R_LIDAR_CAMERA,
     RosPoints,
     check_beams,
     elevations_of,
     read_points,
-    sweep_image,
 )
 from cairn_fusion.ros.topic_mapping import mapping_from_yaml
 from cairn_map.errors import BadInputError, DamagedDataError
+from cairn_map.evidence.grid import geometry_for
 
 ELEVATIONS = (10.0, 4.0, 0.0, -3.5)
 LIDAR = SpinningLidar(width=90, height=4, elevations_deg=ELEVATIONS)
@@ -64,6 +71,40 @@ def cloud(make: Messages, time_s: float, range_m: np.ndarray[Any, np.dtype[np.fl
         data=np.frombuffer(points.tobytes(), np.uint8),
         is_dense=False,
     )
+
+
+def loose_cloud(
+    make: Messages,
+    time_s: float,
+    points: np.ndarray[Any, np.dtype[np.float32]],
+    after_ns: np.ndarray[Any, np.dtype[np.uint32]] | None = None,
+) -> Any:
+    """A message of points without rings and rows, with times of their own if they are given."""
+    types = [("x", 0, 7), ("y", 4, 7), ("z", 8, 7), *([] if after_ns is None else [("t", 12, 6)])]
+    rows = np.zeros(len(points), [("xyz", "<f4", 3), *([] if after_ns is None else [("t", "<u4")])])
+    rows["xyz"] = points
+    if after_ns is not None:
+        rows["t"] = after_ns
+    return make.make(
+        "sensor_msgs/PointCloud2",
+        header=make.header(time_s, "lidar"),
+        height=1,
+        width=len(points),
+        fields=[make.make("sensor_msgs/PointField", name=n, offset=o, datatype=t, count=1) for n, o, t in types],
+        is_bigendian=False,
+        point_step=rows.itemsize,
+        row_step=rows.nbytes,
+        data=np.frombuffer(rows.tobytes(), np.uint8),
+        is_dense=True,
+    )
+
+
+def kitti_of(folder: Path, poses: list[Transform]) -> PoseOptions:
+    kitti(folder, poses)
+    return PoseOptions(path=folder / "poses.txt", of="rig")
+
+
+POSES = [room_pose(0.3 * n, 0.4 * n) for n in range(3)]
 
 
 def drive(make: Messages) -> Iterator[Timed]:
@@ -165,7 +206,7 @@ def test_a_cloud_of_another_lidar_is_refused_with_the_number_that_is_wrong() -> 
         check_beams(turned(SIXTEEN), narrow, "lidar")
 
 
-def test_beams_that_nobody_knows_are_asked_for_and_wrong_ones_end_the_reading(tmp_path: Path) -> None:
+def test_points_without_beams_are_beams_of_their_own_and_wrong_ones_end_the_reading(tmp_path: Path) -> None:
     def messages(make: Messages) -> Iterator[Timed]:
         for time_s, topic, message in drive(make):
             if topic == "/points":
@@ -175,15 +216,104 @@ def test_beams_that_nobody_knows_are_asked_for_and_wrong_ones_end_the_reading(tm
 
     path = write_bag(tmp_path / "flat", "mcap", messages)
     proposal = survey(path).proposal
-    with pytest.raises(BadInputError, match="elevations_deg: DECIDE") as caught:
-        mapping_from_yaml(proposal.text, "bag.yaml")
-    assert caught.value.kind == "undecided"
-    lines = [line for line in proposal.text.splitlines() if not line.startswith("# DECIDE")]
-    beams = next(n for n, line in enumerate(lines) if "elevations_deg" in line)
-    lines[beams - 1 : beams + 1] = ["      columns: 90", f"      elevations_deg: {list(ELEVATIONS)}"]
+    assert proposal.questions == ()
+    loose = open_source(path)
+    points = loose.scan(0).points_m
+    assert points is not None
+    ranges = np.linalg.norm(points, axis=1)
+    expected = swept(0)[np.isfinite(swept(0))]
+    np.testing.assert_allclose(np.sort(ranges[np.isfinite(ranges)]), np.sort(expected), rtol=1e-6)
+    # Beams that somebody knows are taken, if the points lie on them.
+    lines = proposal.text.splitlines()
+    place = next(n for n, line in enumerate(lines) if "kind: cloud" in line)
+    lines[place] = f"    lidar: {{columns: 90, elevations_deg: {list(ELEVATIONS)}}}"
     sweep = open_source(path, mapping=mapping_from_yaml("\n".join(lines), "bag.yaml")).scan(0)
     np.testing.assert_allclose(sweep.range_m, swept(0), rtol=1e-6)
-    lines[beams] = "      elevations_deg: [15, 0, -15]"
+    assert sweep.points_m is None
+    lines[place] = "    lidar: {columns: 90, elevations_deg: [15, 0, -15]}"
     wrong = open_source(path, mapping=mapping_from_yaml("\n".join(lines), "bag.yaml"))
     with pytest.raises(BadInputError, match="elevations_deg does not describe its lidar"):
         wrong.scan(0)
+    lines[place] = "    lidar: {kind: cloud, columns: 90}"
+    with pytest.raises(BadInputError, match="one of kind cloud has neither"):
+        mapping_from_yaml("\n".join(lines), "bag.yaml")
+
+
+def test_packets_of_a_driver_are_told_with_the_program_that_makes_points_of_them(tmp_path: Path) -> None:
+    ROS2.register(get_types_from_msg("uint8[] buf", "ouster_sensor_msgs/msg/PacketMsg"))
+
+    def messages(make: Messages) -> Iterator[Timed]:
+        for time_s, topic, message in drive(make):
+            if topic != "/points":
+                yield time_s, topic, message
+        yield (
+            START_S,
+            "/ouster/lidar_packets",
+            make.make("ouster_sensor_msgs/PacketMsg", buf=np.zeros(8, np.uint8)),
+        )
+
+    question, *_ = survey(write_bag(tmp_path / "packets", "mcap", messages)).proposal.questions
+    assert question.startswith("/ouster/lidar_packets holds raw packets of an Ouster, no points: play the bag through ")
+    assert "replay.launch.xml" in question
+
+
+def test_points_without_rings_give_the_cells_of_the_same_points_in_files(tmp_path: Path) -> None:
+    sweeps = [seen(T, beams(1500, seed=n)) for n, T in enumerate(POSES)]
+
+    def messages(make: Messages) -> Iterator[Timed]:
+        yield START_S, "/tf_static", make.tf(make.transform(START_S, "base_link", "lidar", pose_of(np.eye(4))))
+        for n, (T, points) in enumerate(zip(POSES, sweeps, strict=True)):
+            yield START_S + n, "/tf", make.tf(make.transform(START_S + n, "odom", "base_link", pose_of(T)))
+            yield START_S + n, "/points", loose_cloud(make, START_S + n, points)
+
+    poses = kitti_of(tmp_path, POSES)
+    bag = open_source(write_bag(tmp_path / "drive", "mcap", messages), poses=poses)
+    (tmp_path / "clouds").mkdir()
+    for n, points in enumerate(sweeps):
+        pcd_binary(tmp_path / "clouds" / f"{n:03d}", points)
+    folder = open_source(tmp_path / "clouds", poses=poses)
+    geometry = geometry_for(voxel_edge_m=0.1, channels=())
+    diffs = []
+    for source in (bag, folder):
+        measurement = Measurement(source.rig, geometry)
+        for scan in source:
+            measurement.add(scan)
+        diffs.append(measurement.diff())
+    assert len(diffs[0]) > 1
+    assert diffs[0].keys() == diffs[1].keys()
+    assert all(diffs[0][key] == diffs[1][key] for key in diffs[0])
+
+
+def test_points_of_a_bag_are_moved_by_their_times(tmp_path: Path) -> None:
+    """A lidar half a metre above a base that drives 2 m/s and turns 1 rad/s."""
+    T_base_lidar = np.eye(4)
+    T_base_lidar[2, 3] = 0.5
+
+    def base(time_s: float) -> Transform:
+        return room_pose(2.0 * (time_s - START_S) - 1.0, time_s - START_S)
+
+    def messages(make: Messages) -> Iterator[Timed]:
+        yield START_S, "/tf_static", make.tf(make.transform(START_S, "base_link", "lidar", pose_of(T_base_lidar)))
+        for n in range(51):
+            time_s = START_S + n / 100
+            yield time_s, "/tf", make.tf(make.transform(time_s, "odom", "base_link", pose_of(base(time_s))))
+            if n % 10 == 0 and n < 40:
+                steps = np.arange(100)
+                rays = np.split(beams(2000, seed=n), 100)
+                parts = [seen(base(time_s + k / 1000) @ T_base_lidar, r) for k, r in zip(steps, rays, strict=True)]
+                after_ns = np.repeat(steps * 1_000_000, 20).astype(np.uint32)
+                yield time_s, "/points", loose_cloud(make, time_s, np.concatenate(parts), after_ns)
+
+    path = write_bag(tmp_path / "drive", "mcap", messages)
+    off_m = []
+    for is_deskewed in (False, True):
+        source = open_source(path, is_deskewed=is_deskewed)
+        points = []
+        for scan in source:
+            assert scan.points_m is not None
+            T = scan.T_map_rig @ source.rig["lidar"].transform
+            points.append(transform_points(T, scan.points_m.astype(np.float64)))
+        off_m.append(off_walls_m(np.concatenate(points)))
+    # Half a millimetre of the grid, and half a step of a millisecond.
+    assert off_m[0].max() < 0.005
+    assert (off_m[1] > 0.03).mean() > 0.2

@@ -10,8 +10,10 @@ from tests.fixtures.map.made import SMALL
 from cairn_map.commits.ids import Author, RobotName
 from cairn_map.commits.signature import (
     SIGNATURES_MAX,
+    SMALL_ORDER,
     Signature,
     SigningKey,
+    are_valid,
     check_signatures,
     incarnation_of,
     signatures_from_text,
@@ -80,3 +82,28 @@ def test_too_many_signatures_are_not_looked_at() -> None:
 
 def test_a_key_is_not_shown_by_accident() -> None:
     assert KEY.seed.hex() not in repr(KEY)
+
+
+def test_a_key_of_small_order_signs_nothing() -> None:
+    """With the key 1 and the mark (1, 0) libraries take every message for signed."""
+    one = b"\1" + bytes(31)
+    for key in SMALL_ORDER:
+        for sign in (0, 0x80):
+            signed = key[:-1] + bytes([key[-1] | sign])
+            for point in (one, key, signed):
+                assert not are_valid([Signature(signed, point + bytes(32))], b"anything")
+    # The curve's own arithmetic: eight times such a point is the neutral one, (0, 1), and there are no others.
+    prime = 2**255 - 19
+    d = -121665 * pow(121666, -1, prime) % prime
+    found = {int.from_bytes(key, "little") % prime for key in SMALL_ORDER}
+    for y in found:
+        x2 = (y * y - 1) * pow(d * y * y + 1, -1, prime) % prime
+        for _ in range(3):
+            # Doubling, in squares: y3 = (y^2 + x^2) / (1 - d x^2 y^2), x3^2 = 4 x^2 y^2 / (1 + d x^2 y^2)^2.
+            k = d * x2 * y * y % prime
+            y, x2 = (
+                (y * y + x2) * pow(1 - k, -1, prime) % prime,
+                4 * x2 * y * y * pow((1 + k) ** 2, -1, prime) % prime,
+            )
+        assert (x2, y) == (0, 1)
+    assert len(found) == 5  # y of the eight points: 1, -1, 0 twice, and two of four points each

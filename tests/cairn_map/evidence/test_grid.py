@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from tests.naive import evidence as naive_evidence
 
 from cairn_map.errors import BadInputError
-from cairn_map.evidence.channels import COLOUR, INTENSITY, Channel, ChannelKind
+from cairn_map.evidence.channels import COLOUR, INTENSITY, STANDARD_CHANNELS, TEMPERATURE, Channel, ChannelKind
 from cairn_map.evidence.grid import (
     CELL_LIMIT,
     Cell,
@@ -126,9 +126,24 @@ def test_a_centre_lies_in_its_voxel(voxel: tuple[int, int, int]) -> None:
     assert voxels_of_points(centres, FIVE_CM).tolist() == [list(voxel)]
 
 
-@pytest.mark.parametrize(("edge_m", "depth"), [(0.08, 6), (0.04, 7), (0.02, 8), (0.01, 8), (1.0, 3), (0.05, 6)])
-def test_the_papers_cells_are_5_12_m(edge_m: float, depth: int) -> None:
+@pytest.mark.parametrize(("edge_m", "depth"), [(0.08, 6), (0.04, 7), (0.02, 7), (0.01, 7), (1.0, 3), (0.05, 6)])
+def test_the_papers_cells_are_5_12_m_and_none_has_more_than_128_voxels_along_an_edge(edge_m: float, depth: int) -> None:
     assert geometry_for(voxel_edge_m=edge_m).depth == depth
+
+
+@given(st.integers(1000, 1_000_000))
+def test_a_geometry_without_a_depth_has_the_cells_of_its_voxels(edge_um: int) -> None:
+    alike = geometry_for(voxel_edge_m=edge_um / 1e6)
+    assert Geometry(voxel_edge_um=edge_um) == alike
+    assert Geometry.model_validate_json(f'{{"voxel_edge_um": {edge_um}}}') == alike
+    assert Geometry.model_validate_json(alike.model_dump_json()) == alike
+    assert Geometry(voxel_edge_um=edge_um, depth=8).depth == 8
+
+
+def test_cells_with_more_samples_than_the_standard_channels_have_are_smaller() -> None:
+    dose = Channel(kind=ChannelKind.SCALAR, name="dose", unit="uSv/h", step=0.01)
+    assert geometry_for(voxel_edge_m=0.04, channels=(*STANDARD_CHANNELS, dose)).depth == 6
+    assert geometry_for(voxel_edge_m=0.04, channels=(dose, COLOUR, TEMPERATURE)).depth == 7
 
 
 @pytest.mark.parametrize("edge_m", [0.0, -1.0, 1.1, 0.0001])

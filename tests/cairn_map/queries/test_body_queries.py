@@ -57,8 +57,11 @@ def test_a_path_tells_its_first_collision() -> None:
     found = snapshot.check_box(path, robot)
     # Its front is 0.2 m ahead; at n = 16 it stands at the bar, and touching is not meeting.
     assert (found.first_occupied, found.first_not_free) == (17, 17)
+    assert found.first_occupied_m is not None and found.first_not_free_m is not None
+    assert found.first_occupied_m.tolist() == found.first_not_free_m.tolist() == pytest.approx([0.85, 0.0, 0.2])
     assert found.states[:17].tolist() == [State.FREE] * 17
-    assert snapshot.check_box(path, [[-0.2, -0.1, 0.25], [0.2, 0.1, 0.3]]).first_occupied is None
+    free = snapshot.check_box(path, [[-0.2, -0.1, 0.25], [0.2, 0.1, 0.3]])
+    assert free.first_occupied is free.first_occupied_m is None
     tall = snapshot.check_box(path, [[-0.2, -0.1, 0.25], [0.2, 0.1, 0.41]])
     assert (tall.first_occupied, tall.first_not_free) == (None, 0)
     assert tall.states.tolist() == [State.UNKNOWN] * 30

@@ -148,7 +148,7 @@ def test_many_points_need_little_memory_beside_their_answers(monkeypatch: pytest
         (snapshot.state_at, 1),
         (snapshot.counts_at, 8),
         (snapshot.probability_at, 8),
-        (lambda p: snapshot.cast_rays(p, p, max_range_m=0.5), 33),
+        (lambda p: snapshot.cast_rays(p, p, max_range_m=0.5), 57),
     ):
         ask(points[:1])  # type: ignore[no-untyped-call]
         tracemalloc.start()

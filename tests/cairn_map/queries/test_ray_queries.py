@@ -15,6 +15,7 @@ from cairn_map.errors import BadInputError
 from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.grid import Geometry
 from cairn_map.queries import distance_queries
+from cairn_map.queries.distance_queries import NO_VOXEL
 from cairn_map.queries.map_snapshot import snapshot_of
 from cairn_map.queries.occupancy_states import State
 
@@ -56,6 +57,12 @@ def test_rays_end_where_the_twin_says(geometry: Geometry, seed: int, ends_in_unk
     assert len(np.unique(ends.states)) >= 2
     ended = np.isfinite(ends.distance_m)
     assert [naive.state(world, tuple(voxel)) for voxel in ends.voxels[ended].tolist()] == ends.states[ended].tolist()
+    assert (ends.voxels[~ended] == NO_VOXEL).all() and np.isnan(ends.points_m[~ended]).all()
+    # Where it enters: on the ray, and on that voxel's surface, or in it where it starts there.
+    low_m = ends.voxels[ended] * EDGE_M
+    there = ends.points_m[ended]
+    np.testing.assert_allclose(np.linalg.norm(there - origins[ended], axis=1), ends.distance_m[ended], atol=1e-9)
+    assert ((there >= low_m - 1e-7) & (there <= low_m + EDGE_M + 1e-7)).all()
 
 
 @pytest.mark.parametrize("seed", [1, 2])
@@ -186,6 +193,15 @@ def test_a_ray_that_nearly_lies_in_a_plane_ends_as_one_that_does(part: float) ->
         assert ends.distance_m.tolist() == snapshot.cast_rays([[0, 0, 0]], [flat], max_range_m=10).distance_m.tolist()
 
 
-def test_as_many_directions_as_origins() -> None:
-    with pytest.raises(BadInputError):
-        snapshot_with(PLAIN, WALL).cast_rays([[0, 0, 0]] * 2, [[1, 0, 0]], max_range_m=1)
+def test_one_origin_or_one_direction_is_that_of_all_rays_and_other_numbers_must_agree() -> None:
+    snapshot, directions = snapshot_with(PLAIN, WALL), [[1.0, 0, 0], [0, 1, 0], [1, 1, 0]]
+    many = snapshot.cast_rays([[0.01, 0.01, 0.01]] * 3, directions, max_range_m=1)
+    for origin in ([0.01, 0.01, 0.01], [[0.01, 0.01, 0.01]]):
+        one = snapshot.cast_rays(origin, directions, max_range_m=1)
+        assert one.distance_m.tolist() == many.distance_m.tolist()
+    assert len(snapshot.cast_rays([[0, 0, 0]] * 4, [1, 0, 0], max_range_m=1).states) == 4
+    assert len(snapshot.cast_rays(np.empty((0, 3)), np.empty((0, 3)), max_range_m=1).states) == 0
+    assert repr(many).startswith("RayEnds(3 rays, ")
+    for origins, ways in ((2, 3), (0, 1), (1, 0), (3, 2)):
+        with pytest.raises(BadInputError, match="as many directions as origins, or one of either"):
+            snapshot.cast_rays(np.zeros((origins, 3)), np.ones((ways, 3)), max_range_m=1)

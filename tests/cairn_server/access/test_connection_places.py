@@ -1,5 +1,7 @@
 """Places of connections: bounded, and never full for a newcomer."""
 
+from contextlib import suppress
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -108,10 +110,47 @@ def test_one_token_has_its_share_and_admins_have_all() -> None:
                 door.places.note(place, "mole")
         else:
             door.places.note(place, "mole")
-    for _ in range(LIMIT - SHARE):
+    for _ in range(LIMIT - 1):
         door.places.note(door.enter("10.0.0.1"), object())
+    assert len(held_by(door, "mole")) == 1, "all places are taken, so what it has beyond one goes"
     with pytest.raises(UnreachableError):
         door.places.note(door.enter("10.0.0.1"), object())
+
+
+def test_a_robot_with_tokens_of_many_maps_leaves_the_others_their_places() -> None:
+    door = Door()
+    tokens = [f"map{n}:mole" for n in range(2 * LIMIT // SHARE)]
+    for token in tokens * SHARE:
+        try:
+            door.places.note(door.enter("10.0.0.1"), token)
+        except UnreachableError as exc:
+            assert exc.kind == "busy"
+    assert door.places.taken[1] == LIMIT
+    wren = [door.enter("10.0.0.2") for _ in range(2)]
+    door.places.note(wren[0], "lab:wren")
+    for token in tokens * SHARE:
+        if len(held_by(door, token)) < SHARE:
+            with suppress(UnreachableError):
+                door.places.note(door.enter("10.0.0.1"), token)
+    assert wren[0] in door.open and door.places.taken[1] == LIMIT
+    assert sorted({len(held_by(door, token)) for token in tokens}) == [1, 2]
+    with pytest.raises(UnreachableError):
+        door.places.note(wren[1], "lab:wren")
+
+
+def held_by(door: Door, token: str) -> list[ConnectionPlace]:
+    """Open connections of a token."""
+    return [place for place in door.open if place.holder == token]
+
+
+def test_no_request_that_comes_through_a_proxy_is_cut() -> None:
+    places = ConnectionPlaces(LIMIT, trusted_proxies="172.30.87.2")
+    begun = [places.begin(f"map{n % (LIMIT // SHARE)}:mole") for n in range(LIMIT)]
+    with pytest.raises(UnreachableError):
+        places.begin("lab:wren")
+    places.leave(begun[0])
+    places.begin("lab:wren")
+    assert places.taken == (0, LIMIT)
 
 
 def test_a_proxy_has_no_place_and_its_requests_have() -> None:

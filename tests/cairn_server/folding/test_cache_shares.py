@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from tests.fixtures.server.live import Live, Process
 
-from cairn_server.folding import cell_cache, read_cache
+from cairn_server.folding import fold_memory, read_cache
 from cairn_server.memory_shares import CACHES_BYTES, CACHES_MIN_BYTES, LIMIT_MIN_BYTES, memory_shares
 from cairn_server.views import map_views
 
@@ -14,7 +14,7 @@ from cairn_server.views import map_views
 def test_the_standard_sizes_of_all_caches_add_up() -> None:
     of_reading = (read_cache.EVIDENCE_BYTES, read_cache.STAMPS_BYTES, read_cache.CHANGES_BYTES)
     of_views = (map_views.CELLS_BYTES, map_views.LISTS_BYTES)
-    assert sum((cell_cache.CACHE_BYTES, *of_reading, read_cache.HISTORIES_BYTES, *of_views)) == CACHES_BYTES
+    assert sum((fold_memory.CACHE_BYTES, *of_reading, read_cache.HISTORIES_BYTES, *of_views)) == CACHES_BYTES
 
 
 def test_each_cache_has_its_share(tmp_path: Path) -> None:
@@ -22,7 +22,7 @@ def test_each_cache_has_its_share(tmp_path: Path) -> None:
         service = live.service
         share = CACHES_MIN_BYTES / CACHES_BYTES
         caches = service.sync.replies._cache
-        assert service._fold_thread._local._cells_bytes == int(share * cell_cache.CACHE_BYTES)
+        assert service._fold_thread._local._memory.cells_bytes == int(share * fold_memory.CACHE_BYTES)
         assert caches._evidence._limit_bytes == int(share * read_cache.EVIDENCE_BYTES)
         assert caches.changes._limit_bytes == int(share * read_cache.CHANGES_BYTES)
         assert service.views.pictures._read_cells._limit_bytes == int(share * map_views.CELLS_BYTES)

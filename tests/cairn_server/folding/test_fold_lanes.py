@@ -81,11 +81,11 @@ def test_a_commit_never_waits_for_another_robot_s_costly_ones(store: Store) -> N
     """Thirty costly commits wait: each scan pushed now is in the map after one look, whatever is under way."""
     attack = [costly(n, [dust(WIDE), air(WIDE)][n % 2], keys=[HERE, FAR]) for n in range(30)]
     folder = Folder(store, attack)
-    assert folder.folding.fold(folder.row, maps=1).commits == 0
+    assert folder.folding.fold(folder.row).commits == 0
     for n in range(4):
         folder.push([scan(n)])
         # The plan may be done or not: it is the scan that counts.
-        folder.folding.fold(folder.row, maps=1)
+        folder.folding.fold(folder.row)
         assert scan(n).id in folder.vector()
     folder.finish()
     assert cells_of(store, folder.row) == straight([*attack, *map(scan, range(4))])
@@ -114,7 +114,7 @@ def test_whatever_a_robot_pushes_others_wait_for_no_more_than_a_slice_of_work(
         commits += [mixed(n, commits, chance), scan(n)]
         folder.push(commits[-2:])
         worked_s.clear()
-        folder.folding.fold(folder.row, maps=1)
+        folder.folding.fold(folder.row)
         assert commits[-1].id in folder.vector()
         assert sum(worked_s) <= 2 * commit_work.SLICE_S
     folder.finish()
@@ -154,7 +154,7 @@ def test_who_changes_a_cell_of_a_plan_waits_for_that_plan_and_no_longer(store: S
     folder = Folder(store, [first])
     assert folder.look() == 0
     folder.push([there, here])
-    folder.folding.fold(folder.row, maps=1)
+    folder.folding.fold(folder.row)
     assert there.id in folder.vector()
     assert here.id not in folder.vector() or first.id in folder.vector()
     assert folder.look() >= 0
@@ -172,7 +172,7 @@ def test_a_plan_is_written_behind_what_came_meanwhile_with_the_stamps_of_its_own
     assert folder.look() == 1
     with store.snapshot(folder.row) as snapshot:
         cell = snapshot.cell(HERE)
-        assert cell is not None and cell.lm == snapshot.head.cursor.seq == 3
+        assert cell is not None and cell.lm == snapshot.head.seq == 3
         assert set(decode_stamps(cell.stamps, depth=WIDE.depth, lm=3).tolist()) == {0, 3}
 
 
@@ -195,7 +195,7 @@ def test_retracts_of_costly_commits_are_planned_too(store: Store) -> None:
     folder.finish()
     out = pushed(2, 0, MOLE, geometry=WIDE, cells={}, scans=9, retracts=[first, second])
     folder.push([out, scan(0)])
-    assert folder.folding.fold(folder.row, maps=1).commits == 1
+    assert folder.folding.fold(folder.row).commits == 1
     folder.finish()
     assert cells_of(store, folder.row) == straight([first, second, out, scan(0)])
 

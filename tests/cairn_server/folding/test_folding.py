@@ -18,7 +18,9 @@ from cairn_map.evidence.grid import cell_of_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.folding import fold_thread, group_folding
 from cairn_server.folding.cell_cache import CellCache
+from cairn_server.folding.fold_memory import FoldMemory
 from cairn_server.folding.folding import fold_pending
+from cairn_server.store.history import head_of
 from cairn_server.store.sqlite.store import SqliteStore
 from cairn_server.store.store_rows import MapRow
 
@@ -65,13 +67,18 @@ def damage_diff(store: SqliteStore, row: MapRow, commit: Commit) -> None:
 
 
 @settings(max_examples=10)
-@given(st.lists(st.integers(0, 20), min_size=1, max_size=8), st.integers(1, 4), st.sampled_from([0, 150_000, 1 << 30]))
+@given(
+    st.lists(st.integers(0, 20), min_size=1, max_size=8),
+    st.integers(1, 4),
+    st.sampled_from([0, 150_000, 1 << 30]),
+    st.sampled_from([0, 4000, 1 << 30]),
+)
 def test_grouping_and_memory_make_no_difference(
-    store: SqliteStore, seeds: list[int], group: int, limit_bytes: int
+    store: SqliteStore, seeds: list[int], group: int, limit_bytes: int, spool_bytes: int
 ) -> None:
     commits = [pushed(n, seed) for n, seed in enumerate(seeds)]
     row, other = new_map(store, *commits), new_map(store, *reversed(commits))
-    cache = CellCache(SMALL, limit_bytes=limit_bytes)
+    cache = CellCache(SMALL, FoldMemory(limit_bytes, spool_bytes=spool_bytes))
     while fold_pending(store, row, cache, limit=group):
         assert cache.size_bytes <= max(limit_bytes, ONE_CELL_BYTES)
     fold_pending(store, other, CellCache(SMALL), limit=64)
@@ -105,7 +112,7 @@ def test_a_damaged_commit_is_set_aside_and_repaired_by_pushing_it_again(store: S
     assert read(cells(store, row)) == sum_of([good])
     with store.snapshot(row) as snapshot:
         assert bad.id not in snapshot.pending()
-        assert bad.id not in snapshot.head.vector
+        assert bad.id not in head_of(snapshot).vector
     assert store.append(row, new_of(bad))
     assert fold_pending(store, row, cache, limit=9) == 1
     assert read(cells(store, row)) == sum_of([bad, good])

@@ -5,17 +5,24 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
+from tests.fixtures.map.made import SMALL
 from tests.fixtures.server.answers import cell_path
+from tests.fixtures.server.commit_contract import bodies
 from tests.fixtures.server.damage import BROKEN, damage
 from tests.fixtures.server.live import Live, until
 from tests.fixtures.server.pushes import KEYS, MOLE, WREN, pushed, read, sum_of
+from tests.fixtures.server.store_contract import new_of
+from tests.memory_store.store import MemoryStore
 
 from cairn_map.commits.commit import Commit
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.folding import commit_work
 from cairn_server.folding import group_folding as module
 from cairn_server.folding.cell_cache import CellCache
 from cairn_server.folding.damaged_cells import DamagedCells
-from cairn_server.folding.group_folding import Waiting, fold_around
+from cairn_server.folding.fold_memory import FoldMemory
+from cairn_server.folding.group_folding import LocalFolding, Waiting, fold_around
+from cairn_server.store.history import head_of
 from cairn_server.store.store_rows import MapRow
 
 FIRST, SECOND = pushed(0, 0), pushed(0, 0, WREN)
@@ -170,8 +177,8 @@ def test_of_a_robot_of_which_many_wait_later_commits_wait_so_that_the_vector_has
             live.push(row, commit)
         until(lambda: live.pending(row) == len(ours) + len(theirs) - folded, "the others are folded")
         with live.service.store.snapshot(row) as snapshot:
-            gaps = len(snapshot.head.vector.intervals[MOLE])
-            assert {commit.id for commit in theirs} <= set(snapshot.head.vector)
+            gaps = len(head_of(snapshot).vector.intervals[MOLE])
+            assert {commit.id for commit in theirs} <= set(head_of(snapshot).vector)
         assert gaps == folded - len(theirs)
         heal(live, row, whole)
         assert read(live.cells(row)) == sum_of([*BASE, *ours, *theirs])
@@ -202,3 +209,28 @@ def test_a_server_that_is_started_anew_folds_around_the_cell_again(tmp_path: Pat
         until(lambda: ids_pending(live, row) == {str(pushed(1, 0).id)}, "what is elsewhere is folded")
         heal(live, row, whole)
         assert read(live.cells(row)) == sum_of([*BASE, pushed(1, 0), pushed(2, 1)])
+
+
+def test_maps_that_are_folded_in_turn_share_one_memory_and_keep_their_cells_in_it() -> None:
+    store, memory = MemoryStore(), FoldMemory(cells_bytes=8 << 20)
+    folding = LocalFolding(store, DamagedCells(), memory)
+    rows = [store.create_map(f"hall{n}", SMALL, SensorModel())[0] for n in range(60)]
+    for n in range(3):
+        for row in rows:
+            store.append(row, new_of(pushed(n, n)))
+            assert folding.fold(row).commits == 1
+            kept = [cache for cache in folding._caches.values() if cache.size_bytes]
+            assert sum(cache.size_bytes for cache in kept) <= memory.cells_bytes
+    # Small maps fit all together: none is read again for each commit, however many there are.
+    assert len(kept) == len(rows)
+    for row in rows:
+        assert read(bodies(store, row)) == sum_of([pushed(n, n) for n in range(3)])
+    # In less memory those that were folded longest ago give their cells up, and the map under work has half of it.
+    folding._memory = FoldMemory(cells_bytes=4 * kept[0].size_bytes)
+    for row in rows:
+        store.append(row, new_of(pushed(3, 3)))
+        assert folding.fold(row).commits == 1
+        assert sum(cache.size_bytes for cache in folding._caches.values()) <= folding._memory.cells_bytes
+    for row in rows:
+        assert read(bodies(store, row)) == sum_of([pushed(n, n) for n in range(4)])
+    folding.close()

@@ -253,7 +253,7 @@ def test_retracts_of_each_other_s_commits_in_parts_end_with_the_sum_of_what_is_l
         both = chance.sample(own, min(len(own), 3))
         commits.append(scan(n, chance.choice([HERE, THERE])) if n % 3 else by_wren(n, both))
         folder.push(chance.sample(commits[-2:], 2))
-        chance.choice([folder.look, lambda: folder.folding.fold(folder.row, maps=1).commits])()
+        chance.choice([folder.look, lambda: folder.folding.fold(folder.row).commits])()
     folder.finish()
     assert cells_of(store, folder.row) == straight(commits)
 

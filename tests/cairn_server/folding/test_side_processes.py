@@ -24,7 +24,9 @@ from cairn_map.evidence.grid import cell_of_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.wire.messages import CreateMap, MapInfo
 from cairn_server.folding.damaged_cells import DamagedCells
+from cairn_server.folding.fold_memory import FoldMemory
 from cairn_server.folding.fold_process import FoldProcess, LostProcessError, answer_folds
+from cairn_server.store.sqlite.reads import SqliteReads
 from cairn_server.store.sqlite.store import SqliteStore
 
 pytestmark = pytest.mark.processes
@@ -122,10 +124,12 @@ def test_what_the_process_refuses_is_refused_in_the_same_words(process: Process,
 
 @pytest.fixture
 def far(tmp_path: Path) -> Iterator[tuple[SqliteStore, FoldProcess]]:
-    """A store, and what folds it from the other end of a pipe."""
+    """A store, and what folds it from the other end of a pipe, through which no encoded cell comes, only their file."""
     store = SqliteStore(tmp_path)
     ours, theirs = Pipe()
-    thread = threading.Thread(target=answer_folds, args=(theirs, store._readers))
+    thread = threading.Thread(
+        target=answer_folds, args=(theirs, SqliteReads(store._readers), FoldMemory(spool_bytes=0, folder=tmp_path))
+    )
     thread.start()
     process = FoldProcess(ours, pid=None)
     yield store, process
@@ -147,19 +151,19 @@ def test_a_fold_that_cannot_be_written_is_told_as_it_is_and_tried_again(
         with monkeypatch.context() as full:
             full.setattr(store, "fold", raising(UnreachableError("disk_full", "the disk is full")))
             with pytest.raises(UnreachableError, match="the disk is full"):
-                process.fold(row, store, DamagedCells(), maps=1)
-        assert process.fold(row, store, DamagedCells(), maps=1).commits == len(COMMITS)
-        assert process.fold(row, store, DamagedCells(), maps=1).commits == 0
+                process.fold(row, store, DamagedCells())
+        assert process.fold(row, store, DamagedCells()).commits == len(COMMITS)
+        assert process.fold(row, store, DamagedCells()).commits == 0
         assert served.cells(row) == cells_of(live, *COMMITS)
 
 
 def test_a_process_that_is_gone_is_told_from_a_fold_that_fails(far: tuple[SqliteStore, FoldProcess]) -> None:
     store, process = far
     row, _ = store.create_map("lab", SMALL, SensorModel())
-    assert process.fold(row, store, DamagedCells(), maps=1).commits == 0
+    assert process.fold(row, store, DamagedCells()).commits == 0
     process._link.close()
     with pytest.raises(LostProcessError):
-        process.fold(row, store, DamagedCells(), maps=1)
+        process.fold(row, store, DamagedCells())
 
 
 def test_damage_is_noted_and_folded_around_from_afar(
@@ -179,14 +183,14 @@ def test_damage_is_noted_and_folded_around_from_afar(
             "UPDATE diff SET body = NULL WHERE cell = ? AND commit_number = (SELECT min(number) FROM commits)",
             BROKEN,
         )
-        folded = process.fold(row, store, damaged, maps=1)
+        folded = process.fold(row, store, damaged)
         assert folded.commits == sum(BROKEN not in commit.cells for commit in COMMITS[1:])
         assert folded.waits_for is not None
         assert folded.waits_for.kind == "damaged_store"
         assert damaged.of(row.name) == {BROKEN}
         served.push(row, pushed(40, 1))  # in the other two cells, and damaged at rest before it is folded
         damage(served, "UPDATE diff SET body = x'00' WHERE commit_number = (SELECT max(number) FROM commits)")
-        process.fold(row, store, damaged, maps=1)
+        process.fold(row, store, damaged)
         noted = lambda: [entry.what for entry in store.audit_log.page(after=0, limit=100)]  # noqa: E731
         until(lambda: "damaged_commit" in noted(), "the audit log says so")
 

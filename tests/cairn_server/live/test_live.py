@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.fixtures.server.access import ADMIN, ENROLLER, bearer, robot_token
 from tests.fixtures.server.answers import kind_of
-from tests.fixtures.server.crowded_map import add_log, long_author
+from tests.fixtures.server.crowded_map import add_commits, long_author
 from tests.fixtures.server.listening import by_socket, by_sse, hello_of, socket_url, up_to_head
 from tests.fixtures.server.live import Live, until
 from tests.fixtures.server.pushes import MOLE, WREN, pushed
@@ -109,7 +109,7 @@ def test_who_listens_hears_of_the_head_the_cells_and_the_log(live: Live, listen:
     assert [event.type for event in found] == ["cells", "log", "head"]
     assert logged(found) == [str(COMMITS[0].id)]
     with live.service.store.snapshot(row) as snapshot:
-        assert isinstance(found[2], HeadMoved) and found[2].cursor == str(snapshot.head.cursor)
+        assert isinstance(found[2], HeadMoved) and found[2].cursor == str(snapshot.head)
         lms = {(*cell_of_key(cell.key), cell.lm) for cell in snapshot.cells()}
     assert isinstance(found[0], CellsEvent) and set(found[0].cells) == lms
 
@@ -256,7 +256,7 @@ def test_an_event_as_long_as_one_robot_can_make_it_is_read_by_every_client(live:
     listener.take()
     last = NUMBER_LIMIT - 1 - RETRACTS_MAX
     names = " ".join(str(CommitId(author, last + n)) for n in range(RETRACTS_MAX))
-    add_log(live.service.store, row, [CommitId(author, last - n) for n in range(2 * ENTRIES_MAX)], retracts=names)
+    add_commits(live.service.store, row, [CommitId(author, last - n) for n in range(2 * ENTRIES_MAX)], retracts=names)
     live.service.live.folded(row)
     (grown,) = (event for event in listener.take() if isinstance(event, LogGrew))
     assert (len(grown.entries), grown.left_out) == (4, 2 * ENTRIES_MAX - 4)

@@ -15,7 +15,7 @@ from tests.fixtures.server.access import ADMIN, ENROLLER, bearer, robot_token
 from tests.fixtures.server.answers import kind_of
 from tests.fixtures.server.certificate import certificate
 from tests.fixtures.server.live import Live, until
-from tests.fixtures.server.pushes import MOLE, pushed
+from tests.fixtures.server.pushes import MOLE, WREN, pushed
 
 from cairn_map.errors import BadInputError
 from cairn_server.operations.serve import OTHER_DESCRIPTORS as OTHERS
@@ -114,6 +114,33 @@ def test_a_token_s_streams_and_connections_leave_places_for_other_tokens(tmp_pat
             answer = streams.enter_context(client.stream("GET", f"/maps/{row.name}/events", headers=bearer(ADMIN)))
             assert answer.status_code == (200 if n < 4 else 429)
         assert fresh(live, "GET", f"/maps/{row.name}", wren).status_code == 200
+
+
+def test_a_robot_of_many_maps_keeps_no_other_robot_out(tmp_path: Path) -> None:
+    settings = {"admin_token": ADMIN, "enrolment_token": ENROLLER, "limit_concurrency": PLACES}
+    with Live(tmp_path, **settings) as live, ExitStack() as links:
+        rows = [live.new_map() for _ in range(PLACES // 4 + 1)]
+        wren = robot_token(live, rows[0], "wren")
+        tokens = [robot_token(live, row, "mole") for row in rows]
+        live.http.close()  # its idle connection is an admin's
+        live.http = httpx.Client(base_url=live.http.base_url, timeout=60)
+        until(lambda: live.app.state.places.taken[1] == 0, "only the robot's own connections follow")
+        for row, token in zip(rows, tokens, strict=True):
+            for _ in range(4):
+                client = links.enter_context(httpx.Client(base_url=live.http.base_url, timeout=60))
+                assert client.get(f"/maps/{row.name}", headers=bearer(token)).status_code in (200, 503)
+        assert live.app.state.places.taken[1] == PLACES
+        for n in range(3):
+            assert (
+                fresh(
+                    live,
+                    "PUT",
+                    f"/maps/{rows[0].name}/commits/{pushed(n, 0, WREN).id}",
+                    wren,
+                    content=pushed(n, 0, WREN).data,
+                ).status_code
+                == 201
+            )
 
 
 def test_only_a_trusted_proxy_is_believed_about_addresses(

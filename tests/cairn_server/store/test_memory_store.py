@@ -17,9 +17,11 @@ from tests.fixtures.server.evidence_contract import EvidenceContract
 from tests.fixtures.server.fetching import fetch
 from tests.fixtures.server.live import Live
 from tests.fixtures.server.pushes import MOLE, WREN, pushed, read, sum_of
+from tests.fixtures.server.replica_contract import ReplicaContract
 from tests.fixtures.server.shares_contract import SharesContract
 from tests.fixtures.server.store_contract import StoreContract
 from tests.memory_store import tokens as memory_tokens
+from tests.memory_store.replicas import MemoryReplicaNotes
 from tests.memory_store.store import MemoryStore
 from tests.naive.asker import NaiveAsker
 
@@ -27,6 +29,8 @@ from cairn_client.http.api import MapApi
 from cairn_map.errors import UnreachableError
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.wire.access_messages import CreateToken
+from cairn_server.store.store import Store
+from cairn_server.store.store_age import Clocks
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +52,28 @@ class TestMemoryStore(
     AdmissionContract,
 ):
     """All of the contract."""
+
+
+class Passing:
+    """A steady clock that goes on when a test says so."""
+
+    now_s = 1000.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+class TestMemoryReplicaNotes(ReplicaContract):
+    """Of a store in memory."""
+
+    clock = Passing()
+
+    @pytest.fixture
+    def store(self) -> MemoryStore:
+        return MemoryStore(make_notes=lambda maps: MemoryReplicaNotes(maps, Clocks(steady_s=self.clock)))
+
+    def go_on(self, store: Store, seconds: float) -> None:
+        self.clock.now_s += seconds
 
 
 def test_a_server_works_on_it_as_on_any_other(tmp_path: Path) -> None:

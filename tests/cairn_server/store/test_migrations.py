@@ -41,8 +41,8 @@ def test_an_older_store_opens_with_all_that_it_held_and_goes_on(name: str, tmp_p
     with Live(tmp_path) as live:
         row = live.service.store.map("lab")
         with live.service.store.snapshot(row) as snapshot:
-            assert str(snapshot.head.cursor) == HEADS[name]
-            seq = snapshot.head.cursor.seq
+            assert str(snapshot.head) == HEADS[name]
+            seq = snapshot.head.seq
         assert read(live.cells(row)) == sum_of([*OLD_COMMITS, *OLD_RETRACTS])
         assert {cell.hottest_k for cell in rows_of(live)} == {None}  # no version wrote down how hot they are
         assert [branch.name for branch in live.service.store.branches(row)] == ["mole"]

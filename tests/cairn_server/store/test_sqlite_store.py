@@ -124,7 +124,7 @@ def test_signs_of_life_of_a_crowd_are_few_writes_and_none_is_lost(tmp_path: Path
     for name in names:
         store.register(row, branch(name), token(row, name))
     with store.snapshot(row) as snapshot:
-        cursor = snapshot.head.cursor
+        cursor = snapshot.head
     written = store.health.figures().written
     for name in names:
         store.seen(row, name, cursor)

@@ -74,10 +74,10 @@ def kept(live: Live, row: MapRow, commits: list[Commit]) -> list[bool]:
 
 
 def stable(live: Live, row: MapRow) -> set[CommitId]:
-    """Commits that are stable now: not what a reply of the last ten seconds said."""
-    fresh = StableVectors(live.service.store.age, live.service.settings.stable_after_s)
+    """Commits that are stable now."""
+    vectors = StableVectors(live.service.store.age, live.service.settings.stable_after_s)
     with live.service.store.snapshot(row) as snapshot:
-        return set(fresh.of(row, snapshot))
+        return set(vectors.of(snapshot))
 
 
 @pytest.mark.parametrize("jump_s", JUMPS_S.values(), ids=JUMPS_S)
@@ -115,10 +115,10 @@ def test_a_kept_stable_vector_grows_with_time_that_passes_though_the_clock_was_s
         live.push(row, commit)
         live.folded(row)
         with live.service.store.snapshot(row) as snapshot:
-            assert set(vectors.of(row, snapshot)) == set()
+            assert set(vectors.of(snapshot)) == set()
             clocks.wall_s -= 400 * DAY_S
             clocks.pass_s(DAY_S + 1)
-            assert set(vectors.of(row, snapshot)) == {commit.id}
+            assert set(vectors.of(snapshot)) == {commit.id}
 
 
 def test_time_without_a_server_does_not_count_and_a_clock_behind_it_is_reported(tmp_path: Path) -> None:

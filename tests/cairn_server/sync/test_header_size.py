@@ -3,12 +3,11 @@
 from pathlib import Path
 
 import pytest
-from tests.fixtures.server.crowded_map import add_cells, add_commits, add_to_vector, long_author
+from tests.fixtures.server.crowded_map import add_cells, add_commits, long_author
 from tests.fixtures.server.fetching import ask_missing
 from tests.fixtures.server.live import Live
 
 from cairn_map.commits.ids import NUMBER_LIMIT, OPERATOR, Author, CommitId, Incarnation
-from cairn_map.commits.version_vector import VersionVector
 from cairn_map.evidence.grid import CELL_LIMIT, Cell, cell_key
 from cairn_map.wire.frames import encode_frame, frames_of
 from cairn_map.wire.messages import DAMAGED_MAX, WANTED_MAX, CellIndex, MissingRequest, ReplyHeader, message_from_json
@@ -37,8 +36,6 @@ def crowded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Live:
         add_commits(store, row, [*folded, *gaps], age_s=1e7)
         add_commits(store, row, retracts, retracts="r" * 50)
         add_commits(store, row, [CommitId(author, LAST - 1) for author in AUTHORS[SPLIT:]], age_s=None)
-        vector = VersionVector(dict.fromkeys(AUTHORS, ((LAST, LAST),)))
-        add_to_vector(store, row, vector.with_commits([*gaps, *retracts]))
         damaged = [cell_key((-CELL_LIMIT + n, -CELL_LIMIT, -CELL_LIMIT)) for n in range(DAMAGED_MAX + 1)]
         add_cells(store, row, damaged)
         own.service.cells._damaged.note(row.name, damaged)

@@ -234,6 +234,13 @@ def test_done_sums_the_fingerprints_of_the_cells_without_a_frame(live: Live) -> 
     done = fetch(live, row, asker)[-1]
     assert isinstance(done, Done)
     assert done.rest == everything.hex()
+    # With frames for some cells: they and the rest are all that a newcomer gets.
+    live.push(row, pushed(1, 1, WREN))
+    frames = fetch(live, row, asker)
+    done = frames[-1]
+    assert isinstance(done, Done)
+    assert done.rest_fingerprint != ZERO
+    assert fingerprint_sum(frames) + done.rest_fingerprint == fingerprint_sum(fetch(live, row, NaiveAsker(None)))
 
 
 def test_a_long_reply_ends_with_more_and_the_next_request_goes_on(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,6 +14,7 @@ from tests.fixtures.map.made import MIDDLE
 from tests.fixtures.server.fetching import fetch
 from tests.fixtures.server.live import Live, until
 from tests.fixtures.server.pushes import MOLE, WREN, pushed, sum_of
+from tests.fixtures.server.stores import sqlite_of
 from tests.naive.asker import NaiveAsker
 
 from cairn_map.render.render_request import RenderRequest, request_from
@@ -43,6 +44,7 @@ def own(tmp_path: Path) -> Iterator[Live]:
 
 def saved(live: Live) -> PutBack:
     """Back the store up; the function that puts the backup in its place, under the running server."""
+    sqlite_of(live.service.store)
     folder: Path = live.service.settings.folder
     file = folder / "saved.cairn"
     back_up(folder, file, lambda done, total: None)
@@ -141,10 +143,15 @@ def test_what_was_stable_in_a_lost_history_is_not_called_stable(tmp_path: Path) 
         seconds[0] += 6.0
         stable = own.service.sync.replies._stable
         with own.service.store.snapshot(row) as snapshot:
-            assert set(stable.of(row, snapshot)) == {BEFORE[0].id, X.id}
+            assert set(stable.of(snapshot)) == {BEFORE[0].id, X.id}
         put_back()
         with own.service.store.snapshot(row) as snapshot:
-            assert set(stable.of(row, snapshot)) == {BEFORE[0].id}
+            assert set(stable.of(snapshot)) == {BEFORE[0].id}
+        # As many entries more as were lost, and one: the state that was lost is no beginning of theirs.
+        push(own, row, BEFORE[1], BEFORE[2])
+        seconds[0] += 6.0
+        with own.service.store.snapshot(row) as snapshot:
+            assert set(stable.of(snapshot)) == {commit.id for commit in BEFORE[:3]}
 
 
 def test_streams_end_and_who_comes_again_hears_that_its_place_is_lost(own: Live) -> None:

@@ -16,8 +16,10 @@ from cairn_map.commits.commit import COMMIT_BYTES_MAX
 from cairn_map.errors import BadInputError, UnreachableError
 from cairn_map.wire.messages import CreateMap
 from cairn_server.access.auth import Caller, Role
+from cairn_server.store.replica_notes import BodyPart
+from cairn_server.store.store_rows import Use
 from cairn_server.sync import uploads
-from cairn_server.sync.uploads import Part, Uploads
+from cairn_server.sync.uploads import Uploads
 
 
 def test_a_commit_comes_in_parts_and_is_pushed_with_the_last(live: Live) -> None:
@@ -109,7 +111,8 @@ def test_after_a_quota_the_same_part_comes_again(tmp_path: Path) -> None:
         live.push(row, COMMIT, headers=headers)
         assert_waits(add(live, row, later.data[most:], most, commit=later, headers=headers), 1, 60)
         assert state(live, row, later, headers=headers)["size_bytes"] == most
-        live.service.sync.pushes.meter._minutes.clear()  # a minute later
+        # A minute later.
+        live.service.sync.pushes.meter.accounts.give_back((row.number, "mole"), Use(), day=0, commits=1)
         assert add(live, row, later.data[most:], most, commit=later, headers=headers).status_code == 201
 
 
@@ -129,13 +132,13 @@ def test_where_the_push_must_wait_an_empty_part_tries_again(live: Live, monkeypa
 class Staging:
     """Uploads without a server, and their clock."""
 
-    def __init__(self, live: Live) -> None:
+    def __init__(self, live: Live, uploads: Uploads | None = None) -> None:
         self.now_s = 0.0
         self.row = live.new_map()
-        self.uploads = Uploads(live.service.store, live.service.sync.pushes, steady_s=lambda: self.now_s)
+        self.uploads = uploads or Uploads(live.service.store, live.service.sync.pushes, steady_s=lambda: self.now_s)
 
     def add(self, robot: str, size_bytes: int, *, n: int = 0, total: int = COMMIT_BYTES_MAX, offset: int = 0) -> int:
-        part = Part("0" * 64, total, offset, bytes(size_bytes))
+        part = BodyPart("0" * 64, total, offset, bytes(size_bytes))
         caller = Caller(Role.ROBOT, robot)
         return self.uploads.add(self.row, caller, f"{robot}.{MOLE.incarnation}.{n}", part)[0].size_bytes
 
@@ -222,13 +225,27 @@ def test_who_holds_most_waits_and_loses_nothing(live: Live, monkeypatch: pytest.
     assert staging.add("wren", 1, offset=150) == 151
 
 
+def test_a_robot_on_many_maps_holds_no_more_than_one_share(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(uploads, "STAGED_BYTES_MAX", 1000)
+    one = Staging(live)
+    maps = [Staging(live, one.uploads) for _ in range(8)]
+    for each in maps:
+        each.add("mole", 100)
+    for at in range(0, 500, 100):
+        assert one.add("wren", 100, offset=at) == at + 100
+    with suppress(UnreachableError):
+        maps[0].add("mole", 600, n=1)
+    assert one.add("wren", 0, offset=500) == 500
+    assert one.uploads.staged_bytes() <= 1000
+
+
 def test_a_part_of_nothing_takes_no_place(live: Live) -> None:
     staging = Staging(live)
     for n in range(5):
         staging.add(f"r{n}", 0)
-    assert not staging.uploads._staged
+    assert staging.uploads.staged_bytes() == 0
 
 
 def test_a_bad_id_is_refused(live: Live) -> None:
     with pytest.raises(BadInputError):
-        live.service.sync.uploads.add(live.new_map(), Caller(Role.ADMIN), "?", Part("0" * 64, 1, 0, b""))
+        live.service.sync.uploads.add(live.new_map(), Caller(Role.ADMIN), "?", BodyPart("0" * 64, 1, 0, b""))

@@ -102,3 +102,25 @@ def one_voxel(row: MapRow) -> Evidence:
         np.empty(0, np.uint32),
         np.empty((0, row.geometry.plane_count), np.int64),
     )
+
+
+def test_a_point_in_metres_is_the_voxel_it_lies_in(live: Live) -> None:
+    row = live.new_map()
+    live.push(row, pushed(0, 0))
+    key, body = next(iter(live.cells(row).items()))
+    numbers = text_of(row, key, int(decode_cell(body).evidence.voxels[0]))
+    centre = asked(live, row, numbers)["centre_m"]
+    assert isinstance(centre, list)
+    url = f"/maps/{row.name}/main/voxels"
+    for shift_m in (-0.4, 0.0, 0.4):
+        at = ",".join(f"{value + shift_m * row.geometry.voxel_edge_m:.6f}" for value in centre)
+        assert live.http.get(url, params={"at": at}).json() == asked(live, row, numbers)
+    for text, kind in (
+        ("1,2", "bad_point"),
+        ("a,b,c", "bad_point"),
+        ("nan,0,0", "bad_point"),
+        ("1e5,0,0", "bad_point"),
+    ):
+        answer = live.http.get(url, params={"at": text})
+        assert (answer.status_code, answer.json()["kind"]) == (400, kind)
+    assert live.http.get(url, params={"at": "999999999,0,0"}).status_code == 400

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from tests.fixtures.sim.pages import read_page
 
-from cairn_map.evidence.grid import geometry_for
 from cairn_sim.evaluation.scores import Scores
 from cairn_sim.experiment.codings import CODINGS
 from cairn_sim.experiment.figures import (
@@ -14,6 +13,7 @@ from cairn_sim.experiment.figures import (
     ResolutionFigures,
     RunFigures,
     TruthFigures,
+    paper_geometry,
 )
 from cairn_sim.experiment.plan import PlanView
 from cairn_sim.experiment.report import report_page
@@ -23,7 +23,7 @@ SCORES = Scores(surface=100, surface_occupied=90, surface_free=3, free=50, free_
 
 
 def resolution(edge_m: float, *, truth: bool = True) -> ResolutionFigures:
-    geometry = geometry_for(voxel_edge_m=edge_m)
+    geometry = paper_geometry(edge_m)
     sizes = (100_000, 300_000)
     cells = [
         CellFigures(
@@ -64,7 +64,7 @@ def resolution(edge_m: float, *, truth: bool = True) -> ResolutionFigures:
 def page_of(*edges_m: float, asked: tuple[str, ...] = (), truth: bool = True) -> str:
     run = RunFigures(about={"robot": "<orpheus>", "stops": None}, asked=asked)
     run.resolutions += [resolution(edge_m, truth=truth) for edge_m in edges_m]
-    return report_page(run, PlanView(geometry_for(voxel_edge_m=edges_m[-1]), 0.9), [("labs", [np.eye(4)])])
+    return report_page(run, PlanView(paper_geometry(edges_m[-1]), 0.9), [("labs", [np.eye(4)])])
 
 
 def test_totals_are_the_papers_arithmetic() -> None:

@@ -20,9 +20,12 @@ error; --json prints JSON for programs.
 
 import argparse
 import json
+import re
 import time
 from datetime import UTC, datetime
+from pathlib import Path
 
+from cairn_calib.rig.rig import load_rig
 from cairn_client.cli.arguments import (
     Subparsers,
     add_map_parser,
@@ -39,6 +42,7 @@ from cairn_client.sync.responses import one_line
 from cairn_map.errors import BadInputError
 from cairn_map.wire.messages import Retract
 
+DIGEST = re.compile("[0-9a-f]{64}")
 TIMES = ("pushed_after", "pushed_before", "captured_after", "captured_before")
 
 
@@ -116,7 +120,7 @@ def _add_retract(commands: Subparsers) -> None:
     retract = add_map_parser(commands, "retract", _retract, text="take commits out of a map again, exactly")
     retract.add_argument("--commit", action="append", metavar="ID", help="robot.incarnation.n, as `log` shows it")
     retract.add_argument("--robot", help="all that this robot pushed")
-    retract.add_argument("--rig", metavar="SHA256", help="all that was made with this rig.json (`sha256sum rig.json`)")
+    retract.add_argument("--rig", metavar="RIG", help="all that was made with this rig: its rig.json, or its digest")
     for part in TIMES:
         what, side = part.split("_")
         when = f"all that was {what} {side} a time, UTC: 14:05, 2026-11-20T14:05"
@@ -131,7 +135,7 @@ def _retract(args: argparse.Namespace) -> int:
     request = Retract(
         commits=args.commit or [],
         robot=args.robot,
-        rig=args.rig,
+        rig=rig_digest(args.rig) if args.rig is not None else None,
         note=args.note,
         preview=args.dry_run,
         **{f"{part}_s": seconds_of(getattr(args, part)) for part in TIMES},
@@ -145,6 +149,22 @@ def _retract(args: argparse.Namespace) -> int:
     for commit in done.commits:
         say(f"  {commit}")
     return 0
+
+
+def rig_digest(text: str) -> str:
+    """Digest of a rig, of itself or of a `rig.json`, however that is laid out.
+
+    Raises:
+        BadInputError: kind `bad_rig`: neither.
+    """
+    if DIGEST.fullmatch(text):
+        return text
+    if not Path(text).exists():
+        raise BadInputError(
+            "bad_rig",
+            f"--rig takes a rig.json, or the 64 hex digits that commits state of it; {text!r} is neither",
+        )
+    return load_rig(text).digest()
 
 
 def seconds_of(text: str | None, *, now: datetime | None = None) -> float | None:

@@ -6,7 +6,8 @@ ordinary sync, and a retract takes them out again.
 
 import argparse
 import hashlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 from cairn_client.cli.arguments import Subparsers, add_map_parser, api_of, say, shown_length
@@ -17,7 +18,7 @@ from cairn_map.codec.cell_code import DecodedCell
 from cairn_map.commits.commit import Commit, CommitMeta, make_commit
 from cairn_map.commits.ids import INITIAL, Author, CommitId, Incarnation
 from cairn_map.errors import BadInputError
-from cairn_map.evidence.channels import COLOUR, INTENSITY, TEMPERATURE, Channel, ChannelKind
+from cairn_map.evidence.channels import COLOUR, INTENSITY, STANDARD_CHANNELS, TEMPERATURE, Channel, ChannelKind
 from cairn_map.evidence.grid import Geometry, geometry_for
 from cairn_map.files.cell_folder import FolderHead, read_cells, read_head
 from cairn_map.wire.messages import CreateMap, MapInfo
@@ -35,31 +36,35 @@ FILE_KINDS = {
     ".view": "the view of one cell",
 }
 """Kinds of files that one may take for a map, by their suffix."""
+VOXEL_M = 0.04
 CHANNELS = {"colour": COLOUR, "intensity": INTENSITY, "temperature": TEMPERATURE}
 
 
 def add_parser(commands: Subparsers) -> None:
     """Add the subcommand."""
     create = add_map_parser(commands, "create", _create, text="create a map, empty or from prior data")
-    create.add_argument("--voxel", type=float, default=0.04, metavar="METRES", help="voxel edge (0.04)")
-    create.add_argument("--channels", default="colour,intensity,temperature", help="scalars as NAME:UNIT:STEP")
+    create.add_argument("--voxel", type=float, metavar="METRES", help=f"voxel edge ({VOXEL_M:g}, or that of --from)")
+    create.add_argument(
+        "--channels", help="colour,intensity,temperature, or those of --from; scalars as NAME:UNIT:STEP; '' for none"
+    )
     create.add_argument("--from", dest="source", metavar="DIR|URL", help="folder of cells, or another map's URL")
 
 
 def _create(args: argparse.Namespace) -> int:
     tokens = args.token.bound_to(args.map)
     api, name = api_of(args.map, tokens)
-    geometry = _geometry(args)
     if args.source is not None:
+        # A grid that is asked for as well has to be the source's: evidence cannot be moved to another one.
+        asked = _Asked(args.voxel, None if args.channels is None else _channels(args.channels))
         with api:
-            info, count, added = push_prior_data(api, name, args.source, tokens=tokens)
+            info, count, added = push_prior_data(api, name, args.source, tokens=tokens, check=asked.check)
         say_map(info)
         say(f"started from {args.source}: {count} cells, as the commit of author `initial`")
         if added < count:
             say(f"{count - added} of them were pushed before, and are not added again (nor if they were retracted)")
         return 0
     with api:
-        made = api.create_map(name, CreateMap(geometry=geometry))
+        made = api.create_map(name, CreateMap(geometry=_geometry(args)))
     say_map(made)
     return 0
 
@@ -75,19 +80,26 @@ def say_map(info: MapInfo) -> None:
 
 
 def push_prior_data(
-    api: MapApi, name: str, source: str, *, tokens: OriginTokens = NO_TOKENS
+    api: MapApi,
+    name: str,
+    source: str,
+    *,
+    tokens: OriginTokens = NO_TOKENS,
+    check: Callable[[Geometry], None] = lambda _: None,
 ) -> tuple[MapInfo, int, int]:
     """Create a map with the grid and the evidence of a folder or another map; returns it, the
     count of cells, and how many of them were added.
 
     A source that is a URL is read with the token that `tokens` has for its server. It may be repeated after a cut
-    link: evidence that is there already is not added again.
+    link: evidence that is there already is not added again. `check` may refuse the source's grid, before anything
+    is made.
 
     Raises:
         BadInputError: the source is neither a folder of cells nor a map's URL.
         ConflictError: the map exists with another grid.
     """
     head, cells = _open(source, tokens)
+    check(head.geometry)
     api.create_map(name, CreateMap(geometry=head.geometry, sensor_model=head.sensor_model))
     count = added = 0
     author: Author | None = None
@@ -160,9 +172,35 @@ def _commit(commit: CommitId, cells: list[DecodedCell], geometry: Geometry) -> C
     return make_commit(meta, {cell.key: cell.evidence for cell in cells}, geometry)
 
 
+@dataclass(frozen=True, slots=True)
+class _Asked:
+    """Grid that was asked for, as far as it was."""
+
+    voxel_edge_m: float | None
+    channels: tuple[Channel, ...] | None
+
+    def check(self, found: Geometry) -> None:
+        """Refuse another grid than was asked for.
+
+        Raises:
+            BadInputError: kind `other_geometry`.
+        """
+        is_other_edge = self.voxel_edge_m is not None and round(self.voxel_edge_m * 1e6) != found.voxel_edge_um
+        if is_other_edge or (self.channels is not None and self.channels != found.channels):
+            raise BadInputError(
+                "other_geometry",
+                f"the source of --from has {found}: its evidence cannot be moved to another grid. Leave --voxel and "
+                "--channels out, or make an empty map of that grid and replay the recordings",
+            )
+
+
 def _geometry(args: argparse.Namespace) -> Geometry:
-    channels = tuple(_channel(text) for text in args.channels.split(",")) if args.channels else ()
-    return geometry_for(voxel_edge_m=args.voxel, channels=channels)
+    channels = STANDARD_CHANNELS if args.channels is None else _channels(args.channels)
+    return geometry_for(voxel_edge_m=VOXEL_M if args.voxel is None else args.voxel, channels=channels)
+
+
+def _channels(text: str) -> tuple[Channel, ...]:
+    return tuple(map(_channel, text.split(","))) if text else ()
 
 
 def _channel(text: str) -> Channel:

@@ -24,6 +24,7 @@ from contextlib import suppress
 from datetime import UTC, datetime
 
 from cairn_client.cli.arguments import Subparsers, add_map_parser, api_of, say, shown_bytes
+from cairn_client.sync.responses import one_line
 from cairn_map.commits.cursor import cursor_from_text
 from cairn_map.errors import BadInputError
 from cairn_map.wire.messages import LogEntry
@@ -76,7 +77,13 @@ def _log_line(entry: LogEntry, taken_out: int | None) -> str:
     if entry.retracts:
         more = f" and {len(entry.retracts) - 1} more" if len(entry.retracts) > 1 else ""
         line += f"  retracts {entry.retracts[0]}{more}"
-    return line + (f"  (taken out by {taken_out})" if entry.kind == "+" and taken_out else "")
+    line += f"  (taken out by {taken_out})" if entry.kind == "+" and taken_out else ""
+    return line + _note(entry)
+
+
+def _note(entry: LogEntry) -> str:
+    """Note of a commit's author, in the line of the entry that folded it."""
+    return f"  {one_line(entry.note)!r}" if entry.kind == "+" and entry.note else ""
 
 
 def _shown_time(captured_s: tuple[float, float] | None) -> str:
@@ -190,4 +197,4 @@ def _remarks(entry: LogEntry) -> str:
     if entry.kind == "+" and entry.seen:
         with suppress(BadInputError):  # the author's own words, unchecked
             text += f"  saw {cursor_from_text(entry.seen).seq}"
-    return text
+    return text + _note(entry)

@@ -98,8 +98,7 @@ def difference(a: MapSide, b: MapSide) -> Difference:
     if a.geometry != b.geometry:
         raise BadInputError(
             "other_geometry",
-            f"{a.name} and {b.name} have other grids: voxels of {a.geometry.voxel_edge_m:g} m and "
-            f"{b.geometry.voxel_edge_m:g} m, or other channels",
+            f"{a.name} has {a.geometry}, {b.name} has {b.geometry}: they cannot be compared",
         )
     of_a, of_b = a.cells["key"], b.cells["key"]
     common, rows_a, rows_b = np.intersect1d(of_a, of_b, assume_unique=True, return_indices=True)

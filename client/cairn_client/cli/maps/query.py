@@ -1,4 +1,4 @@
-"""Ask a map that lies in a folder, without a server.
+"""Ask a map on a server, or in a folder, without a robot.
 
     $ cairn map export http://127.0.0.1:8750/maps/lab --cells lab/
     $ cairn map query lab/ points 1.02,2.5,0.4 -0.3,0,1
@@ -11,7 +11,8 @@
     $ cairn map query lab/ slice 0.5                          # a horizontal layer: # occupied, . free
     $ cairn map query lab/ height --box=-5,-5,0,5,5,2         # the highest surface of each column, metres
 
-The folder is one of `cairn map export --cells`, or the state folder of a robot that is not running. All lengths are
+A map is a URL, whose cells are all downloaded first, or a folder: one of `cairn map export --cells`, a clone, or the
+state folder of a robot that is not running. All lengths are
 metres in the map's frame, temperatures degrees Celsius here and kelvin in JSON; unknown values are `-`, in JSON null.
 --json prints JSON for programs; `slice` and `height` then give all pixels, rows along y and columns along x.
 """
@@ -20,13 +21,12 @@ import argparse
 import json
 import math
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from cairn_client.cli.arguments import Subparsers, say
+from cairn_client.cli.arguments import Subparsers, add_token, say
 from cairn_client.cli.robot_arguments import box, place
 from cairn_client.folders.map_folder import open_map
 from cairn_map.evidence.channels import ChannelKind
@@ -47,9 +47,10 @@ Answer = Callable[[MapSnapshot, argparse.Namespace], tuple[Any, list[str]]]
 
 def add_parser(commands: Subparsers) -> None:
     """Add the subcommand, each of whose questions is a subcommand in turn."""
-    text = "ask a map that lies in a folder, without a server"
+    text = "ask a map on a server or in a folder"
     query = commands.add_parser("query", help=text, description=__doc__)
-    query.add_argument("folder", type=Path, help="cells, or a robot's state")
+    query.add_argument("map", metavar="URL|DIR", help="http://HOST:PORT/maps/NAME, cells, a clone, or a robot's state")
+    add_token(query)
     query.set_defaults(run=_run)
     questions = query.add_subparsers(required=True, metavar="QUESTION")
 
@@ -83,7 +84,8 @@ def add_parser(commands: Subparsers) -> None:
 
 def _run(args: argparse.Namespace) -> int:
     answer: Answer = args.answer
-    found, lines = answer(open_map(args.folder), args)
+    token = args.token.of(args.map) if "://" in args.map else None
+    found, lines = answer(open_map(args.map, token=token), args)
     for line in [json.dumps(found)] if args.json else lines:
         say(line)
     return 0
@@ -112,9 +114,11 @@ def _ray(snapshot: MapSnapshot, args: argparse.Namespace) -> tuple[Any, list[str
     ends = snapshot.cast_rays([args.origin], [args.direction], max_range_m=args.range)
     if not ends.hit[0]:
         far = "as far as the map goes" if math.isinf(args.range) else f"within {args.range:g} m"
-        return {"hit": False, "distance_m": None, "voxel": None}, [f"nothing is in the way {far}"]
-    distance_m, voxel = float(ends.distance_m[0]), ends.voxels[0].tolist()
-    return {"hit": True, "distance_m": distance_m, "voxel": voxel}, [f"occupied after {distance_m:.3f} m"]
+        return {"hit": False, "distance_m": None, "voxel": None, "point_m": None}, [f"nothing is in the way {far}"]
+    distance_m, voxel, point_m = float(ends.distance_m[0]), ends.voxels[0].tolist(), ends.points_m[0].tolist()
+    place = ", ".join(f"{value:.3f}" for value in point_m)
+    found = {"hit": True, "distance_m": distance_m, "voxel": voxel, "point_m": point_m}
+    return found, [f"occupied after {distance_m:.3f} m, at ({place})"]
 
 
 def _nearest(snapshot: MapSnapshot, args: argparse.Namespace) -> tuple[Any, list[str]]:
@@ -122,8 +126,10 @@ def _nearest(snapshot: MapSnapshot, args: argparse.Namespace) -> tuple[Any, list
     what = "unknown" if args.unknown else "occupied"
     nearest = ask(args.points, radius_m=args.radius)
     found, lines = [], []
-    for (x, y, z), distance_m in zip(args.points, nearest.distance_m.tolist(), strict=True):
-        found.append({"point_m": [x, y, z], "distance_m": _or_none(distance_m)})
+    asked = zip(args.points, nearest.distance_m.tolist(), nearest.points_m.tolist(), strict=True)
+    for (x, y, z), distance_m, nearest_m in asked:
+        there = nearest_m if math.isfinite(distance_m) else None
+        found.append({"point_m": [x, y, z], "distance_m": _or_none(distance_m), "nearest_m": there})
         text = f"{distance_m:.3f} m to {what} space" if math.isfinite(distance_m) else f"none within {args.radius:g} m"
         lines.append(f"{x:8.3f}{y:8.3f}{z:8.3f}  {text}")
     return found, lines

@@ -31,6 +31,7 @@ import numpy as np
 
 from cairn_client.cli.arguments import Subparsers, add_token, api_of, say
 from cairn_client.cli.robot_arguments import add_spread_arguments, place, spread_of
+from cairn_client.cli.source_arguments import add_source_arguments, asked_source
 from cairn_client.folders.map_folder import FolderMap, map_of_folder
 from cairn_map.errors import BadInputError
 from cairn_map.render.map_picture import arrays_of, layer_picture, layer_values, npz_of
@@ -63,11 +64,16 @@ def add_parser(commands: Subparsers) -> None:
     render.add_argument("--low", type=float, help="lower end of the scale (10 deg C)")
     render.add_argument("--high", type=float, help="upper end of the scale (50 deg C)")
     render.add_argument("--range", type=float, default=20.0, metavar="METRES", help="longest range of sight (20)")
-    render.add_argument("--over", metavar="RECORDING", help="draw over a camera's image: a recording's folder")
+    render.add_argument(
+        "--over",
+        metavar="RECORDING",
+        help="draw over a camera's image: of anything that `cairn robot replay` takes, with the same options",
+    )
     render.add_argument("--scan", type=int, default=0, metavar="N", help="number of the scan (0)")
     render.add_argument("--camera", metavar="NAME", help="name of the colour camera (the first)")
     add_spread_arguments(render)
     add_token(render)
+    add_source_arguments(render)
     render.set_defaults(run=_run)
 
 
@@ -76,6 +82,7 @@ def _run(args: argparse.Namespace) -> int:
         raise BadInputError("nothing_asked", "say what to write: -o FILE.png, or --npz FILE")
     is_url = args.map.startswith(("http://", "https://"))
     if args.over is None:
+        _check_no_source(args)
         if args.eye is None or args.target is None:
             raise BadInputError("nothing_asked", "say from where to look, and at what: --from X,Y,Z --to X,Y,Z")
         request = _request(args)
@@ -90,6 +97,14 @@ def _run(args: argparse.Namespace) -> int:
         )
     _draw_over(args, _folder_map(args))
     return 0
+
+
+def _check_no_source(args: argparse.Namespace) -> None:
+    """Refuse options about a recording where none is asked for."""
+    names = ("topics", "poses", "depth", "pose", "frames", "up", "T_map_world")
+    given = [name for name in names if getattr(args, name) is not None]
+    if given:
+        raise BadInputError("bad_option", f"--{given[0].replace('_', '-')} is about a recording: give --over RECORDING")
 
 
 def _folder_map(args: argparse.Namespace) -> FolderMap:
@@ -107,10 +122,9 @@ def _folder_map(args: argparse.Namespace) -> FolderMap:
 def _draw_over(args: argparse.Namespace, found: FolderMap) -> None:
     """The map over one image of a recording."""
     from cairn_client.cli.maps.overlay_drawing import MapOverlay, about, modes_of  # fusion, only where it is asked for
-    from cairn_fusion.importers import open_source
     from cairn_fusion.view.overlay import OverlayStyle, with_overlay_legend
 
-    source = open_source(args.over)
+    source = asked_source(Path(args.over), args)
     if not 0 <= args.scan < len(source):
         raise BadInputError("no_scan", f"{args.over} has scans 0 to {len(source) - 1}, got {args.scan}")
     style = OverlayStyle(layer=args.layer, scale=_scale(args), range_max_m=args.range)

@@ -1,4 +1,4 @@
-"""`cairn robot inspect`: the topics of a bag of ROS, and a proposal of those to map."""
+"""`cairn robot inspect`: contents of a recording; for a bag of ROS also a proposal of the topics to map."""
 
 import argparse
 import json
@@ -7,16 +7,25 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from cairn_client.cli.arguments import Subparsers, say, shown_bytes
-from cairn_map.errors import ConflictError
+from cairn_client.cli.source_arguments import add_source_arguments, asked_source
+from cairn_fusion.recording.view_agreement import pose_doubt
+from cairn_fusion.recording.way_doubts import way_doubts
+from cairn_map.errors import BadInputError, ConflictError
 from cairn_map.progress import counting
 
 if TYPE_CHECKING:
     from cairn_fusion.ros.bag_index import TopicIndex
     from cairn_fusion.ros.bag_recording import Survey
 
-TEXT = """List the topics of a bag (FILE.bag, FILE.mcap, FILE.db3, or a folder of rosbag2), and propose the YAML file
-that says which of them are depth, colour, thermal images and poses. It needs no ROS.
+TEXT = """Say what a recording holds, how its poses were read, and which way is up in it, with the options of replay:
+
+    $ cairn robot inspect clouds/ --poses poses.txt --poses-of rig
+
+For a bag (FILE.bag, FILE.mcap, FILE.db3, a folder of rosbag2) without --topics, list its topics, and propose the YAML
+file that says which of them are depth, colour, thermal images and poses. It needs no ROS.
 
     $ cairn robot inspect lab.bag --output lab.yaml
     $ cairn robot replay lab.bag --topics lab.yaml --map URL --voxel 0.04
@@ -26,8 +35,13 @@ nothing to decide."""
 
 
 def _inspect(args: argparse.Namespace) -> int:
+    from cairn_fusion.importers import SourceLayout, detect_layout
     from cairn_fusion.ros.bag_recording import survey
 
+    is_bag = args.depth is None and detect_layout(args.bag) is SourceLayout.BAG
+    if not is_bag or args.topics is not None:
+        _show_source(args)
+        return 0
     if args.output is not None and args.output.exists() and not args.force:
         raise ConflictError("file_exists", f"{args.output} exists; --force writes over it")
     with counting(args.bag.name, "messages") as on_message:
@@ -46,6 +60,43 @@ def _inspect(args: argparse.Namespace) -> int:
     for question in found.proposal.questions:
         sys.stderr.write(f"to decide: {question}\n")
     return 0
+
+
+def _show_source(args: argparse.Namespace) -> None:
+    """Write the contents of what replay would map."""
+    from cairn_fusion.recording.upright import upright_of
+
+    if args.output is not None:
+        raise BadInputError("bad_option", "--output is about the topics of a bag")
+    source = asked_source(args.bag, args)
+    first, last = source.scan(0), source.scan(len(source) - 1)
+    times = f", {last.time_s - first.time_s:.1f} s" if source.has_times else ""
+    ranges_m = first.range_m[np.isfinite(first.range_m)]
+    low_m, mid_m, high_m = np.quantile(ranges_m, (0.01, 0.5, 0.99)) if len(ranges_m) else (np.nan, np.nan, np.nan)
+    upright = upright_of(source)
+    up = "up: no floor was found" if upright is None else upright.text()
+    if args.json:
+        say(
+            json.dumps(
+                {
+                    "path": str(args.bag),
+                    "scans": len(source),
+                    "times_s": [first.time_s, last.time_s] if source.has_times else None,
+                    "cameras": {name: mounted.spectrum.value for name, mounted in source.rig.cameras.items()},
+                    "poses": list(source.pose_notes),
+                    "up": None if upright is None else upright.axis,
+                }
+            )
+        )
+        return
+    say(f"{source.name}: {len(source)} scans{times}")
+    for name, mounted in source.rig.cameras.items():
+        say(f"  {name}: {mounted.spectrum.value}, {mounted.camera.width} x {mounted.camera.height} pixels")
+    say(f"ranges of the first: {low_m:.2f} to {high_m:.2f} m, median {mid_m:.2f} m")
+    for note in (*source.pose_notes, source.rounding.text(), pose_doubt(source), *way_doubts(source)):
+        if note:
+            say(note)
+    say(up)
 
 
 def _show(found: "Survey") -> None:
@@ -114,11 +165,12 @@ def add_parser(commands: Subparsers) -> None:
     """Add the subcommand."""
     inspect = commands.add_parser(
         "inspect",
-        help="list the topics of a bag of ROS, and propose those to map",
+        help="say what a recording holds; of a bag of ROS, propose the topics to map",
         description=TEXT,
     )
-    inspect.add_argument("bag", type=Path, help="FILE.bag, FILE.mcap, FILE.db3, or a folder of rosbag2")
+    inspect.add_argument("bag", type=Path, metavar="RECORDING", help="anything that replay takes")
     inspect.add_argument("-o", "--output", type=Path, metavar="YAML", help="write the proposed file there")
     inspect.add_argument("--force", action="store_true", help="write over a file that exists")
     inspect.add_argument("--json", action="store_true", help="print JSON")
+    add_source_arguments(inspect)
     inspect.set_defaults(run=_inspect)

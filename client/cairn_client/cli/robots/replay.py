@@ -9,16 +9,17 @@ from pathlib import Path
 import numpy as np
 
 from cairn_client.cli.arguments import Subparsers, api_of, say, shown_bytes, shown_length
-from cairn_client.cli.frame_arguments import add_frame_arguments, frame_options
-from cairn_client.cli.pose_arguments import add_pose_arguments, pose_options
 from cairn_client.cli.range_arguments import add_ranges, integrator_of, returns_line
-from cairn_client.cli.robot_arguments import add_map, scope_of
+from cairn_client.cli.robot_arguments import add_kept_scans, add_map, kept_scans_bytes, scope_of
+from cairn_client.cli.source_arguments import add_source_arguments, asked_source
 from cairn_client.http.api import MapApi
 from cairn_client.robot.robot import Robot
-from cairn_fusion.importers import open_source
+from cairn_fusion.mapping.grouping import Grouping, OpenGroup
 from cairn_fusion.recording.recording import ScanSource
+from cairn_fusion.recording.turned_source import TurnedSource
+from cairn_fusion.recording.upright import upright_of
 from cairn_fusion.recording.view_agreement import pose_doubt
-from cairn_fusion.ros.topic_mapping import mapping_of
+from cairn_fusion.recording.way_doubts import way_doubts
 from cairn_map.codec.cell_code import Profile
 from cairn_map.commits.commit import Commit
 from cairn_map.errors import BadInputError, DamagedDataError, NotFoundError, UnreachableError
@@ -36,21 +37,10 @@ SYNC_EVERY_S = 2.0
 
 def _replay(args: argparse.Namespace) -> int:
     # What to replay, and on which map.
-    options, size = frame_options(args), args.scans_per_measurement
-    mapping = mapping_of(args.topics) if args.topics else None
-    source = open_source(
-        args.recording,
-        options=options,
-        mapping=mapping,
-        frames=args.frames,
-        scans_per_measurement=size,
-        poses=pose_options(args),
-    )
+    size = args.scans_per_measurement
+    source = asked_source(args.recording, args, scans_per_measurement=size)
     _say_range(source)
-    # Poses that somebody described may be described wrongly.
-    doubt = pose_doubt(source) if options is not None or args.poses is not None else None
-    if doubt is not None:
-        say(doubt)
+    _say_doubts(source, args)
     geometry = ensure_map(args, source)
     name = args.name or default_name(source.name)
     state = args.state or Path(f"cairn-{name}")
@@ -61,6 +51,10 @@ def _replay(args: argparse.Namespace) -> int:
         )
     # Map this robot's share, and take a note, so that the evidence is not counted twice.
     stops = source.measurements()[args.share[0] - 1 :: args.share[1]]
+    # Scans that neither the recording nor an option groups are grouped as they come.
+    is_open = size is None and all(len(stop) == 1 for stop in stops)
+    grouping = Grouping() if source.has_times else Grouping(seconds_max=None)
+    group = OpenGroup(grouping) if is_open else None
     start_s = time.monotonic()
     scans = sum(map(len, stops))
     with Robot(
@@ -75,35 +69,48 @@ def _replay(args: argparse.Namespace) -> int:
         scope=scope_of(args, args.mode),
         link=args.link,
         stay=True,
+        keep_scans_bytes=kept_scans_bytes(args),
     ) as robot:
-        commits = _map_stops(robot, source, stops, Profile(args.profile) if args.profile else None)
+        commits = _map_stops(robot, source, stops, Profile(args.profile) if args.profile else None, group)
         with (state / REPLAYED_FILE).open("a") as file:
             file.write(f"{part}\n")
         mapped_s = time.monotonic() - start_s
         # The second round tells the server where this robot stands now.
         is_linked = _try_sync(robot) and _try_sync(robot)
+        is_folded = is_linked and _is_folded(robot)
+        total_s = time.monotonic() - start_s
         waiting, traffic, returns = robot.waiting, robot.traffic, robot.returns
     say(
         f"replayed {scans} scans as {commits} commits in {mapped_s:.1f} s ({scans / mapped_s:.1f} scans/s), "
         f"{shown_bytes(traffic.up_bytes)} up, {shown_bytes(traffic.down_bytes)} down, {waiting} commits wait"
     )
     say(returns_line(returns))
+    if is_folded:
+        say(f"all of it is in the server's map: {total_s:.1f} s in all, with push and fold")
     if not is_linked:
         say(f"no link to {args.map}: `cairn robot sync {state} --map URL` pushes them when there is one")
     return 0
 
 
-def _map_stops(robot: Robot, source: ScanSource, stops: Sequence[range], profile: Profile | None) -> int:
-    """Map measurements one after the other, with a sync now and then; the number of commits made."""
+def _map_stops(
+    robot: Robot, source: ScanSource, stops: Sequence[range], profile: Profile | None, group: OpenGroup | None
+) -> int:
+    """Map measurements, or single scans by a grouping, with a sync now and then; the number of commits made."""
     commits, last_sync_s = 0, time.monotonic()
+    # The map's log says how its z axis was found.
+    note = source.text if isinstance(source, TurnedSource) else ""
     for stop in with_progress(stops, source.name, total=len(stops)):
         for index in stop:
-            robot.observe(source.scan(index))
-        commits += _commit(robot, profile) is not None
+            scan = source.scan(index)
+            if group is not None and group.ends_before(scan.time_s, scan.T_map_rig):
+                commits += _commit(robot, profile, note) is not None
+            robot.observe(scan)
+        if group is None:
+            commits += _commit(robot, profile, note) is not None
         if time.monotonic() - last_sync_s > SYNC_EVERY_S:
             _try_sync(robot)
             last_sync_s = time.monotonic()
-    return commits
+    return commits + (_commit(robot, profile, note) is not None)
 
 
 def _say_range(source: ScanSource) -> None:
@@ -119,20 +126,35 @@ def _say_range(source: ScanSource) -> None:
         say(rounded)
 
 
+def _say_doubts(source: ScanSource, args: argparse.Namespace) -> None:
+    """Write doubts about poses that somebody described, and about z as the axis that points up."""
+    if args.intrinsics is not None or args.poses is not None:
+        doubt = pose_doubt(source)
+        if doubt is not None:
+            say(doubt)
+    if args.poses is None:
+        for doubt in way_doubts(source):
+            say(doubt)
+    if args.up is None and args.T_map_world is None:
+        upright = upright_of(source)
+        if upright is not None and (text := upright.doubt()):
+            say(text)
+
+
 def _replayed(state: Path) -> set[str]:
     """Recordings, with the share, that a robot's folder has replayed."""
     path = state / REPLAYED_FILE
     return set(path.read_text().splitlines()) if path.exists() else set()
 
 
-def _commit(robot: Robot, profile: Profile | None) -> Commit | None:
+def _commit(robot: Robot, profile: Profile | None, note: str) -> Commit | None:
     """Commit; where the folder's limits are reached, after a sync, which may make room."""
     try:
-        return robot.commit(profile=profile)
+        return robot.commit(profile=profile, note=note)
     except UnreachableError as exc:
         if exc.kind != "outbox_full" or not (_try_sync(robot) and _try_sync(robot)):
             raise
-        return robot.commit(profile=profile)
+        return robot.commit(profile=profile, note=note)
 
 
 def _try_sync(robot: Robot) -> bool:
@@ -143,6 +165,14 @@ def _try_sync(robot: Robot) -> bool:
     except DamagedDataError as exc:
         log.error("%s", exc.message)  # mapping goes on: sound cells have come, and own commits are pushed
     return True
+
+
+def _is_folded(robot: Robot) -> bool:
+    """True once the server's map holds all that was pushed; False if that takes longer, or the link is lost."""
+    try:
+        return robot.sync(until_folded=True).is_up_to_date
+    except (UnreachableError, DamagedDataError):
+        return False
 
 
 def ensure_map(args: argparse.Namespace, source: ScanSource) -> Geometry | None:
@@ -193,24 +223,32 @@ def add_parser(commands: Subparsers) -> None:
     """Add the subcommand."""
     replay = commands.add_parser("replay", help="map a recording", description="map a recording")
     add_map(replay)
-    replay.add_argument("recording", type=Path, help="recording folder, known published layout, or bag of ROS")
-    replay.add_argument("--topics", type=Path, metavar="YAML", help="meaning of a bag's topics; see inspect")
+    replay.add_argument(
+        "recording", type=Path, help="recording folder, known published layout, folder of point clouds, or bag of ROS"
+    )
     replay.add_argument("--voxel", type=float, metavar="METRES", help="make the map with this voxel edge if needed")
     replay.add_argument(
         "--again", action="store_true", help="replay a recording once more that this robot has replayed"
     )
     replay.add_argument("--share", type=_share, default=(1, 1), metavar="I/N", help="every N-th measurement from I on")
-    replay.add_argument("--scans-per-measurement", type=int, metavar="N", help="regroup the scans")
+    bounds = Grouping()
+    replay.add_argument(
+        "--scans-per-measurement",
+        type=int,
+        metavar="N",
+        help=f"scans of one commit (those that the recording groups, else up to {bounds.scans_max} within "
+        f"{bounds.seconds_max:g} s and {bounds.metres_max:g} m)",
+    )
     add_ranges(replay)
     replay.add_argument("--state", type=Path, metavar="DIR", help="the robot's folder (cairn-NAME)")
+    add_kept_scans(replay)
     replay.add_argument("--mode", choices=("high-end", "low-end"), default="high-end")
     replay.add_argument(
         "--profile",
         choices=list(Profile),
         help="small: four tenths fewer bytes, more work (as --link wants it)",
     )
-    add_frame_arguments(replay)
-    add_pose_arguments(replay)
+    add_source_arguments(replay)
     replay.set_defaults(run=_replay)
 
 

@@ -6,7 +6,8 @@
     ^Cmapped 12 scans as 3 commits, 120.5 kB up, 8.1 kB down; 0 commits wait
 
 SPOOL holds recordings (RECORDING.md), a folder each, in the order of their names; one is taken when it has its
-recording.json, which is written last. So a driver writes each stop as a recording of its own. Each measurement is
+recording.json, which is written last. So a driver writes each stop as a recording of its own. Scans that the recording
+does not group (measurements.txt) become commits of up to 50 scans, 5 s and 2 m. Each measurement is
 mapped exactly once, whatever happens: the robot's folder records those that are done. --delete removes recordings that
 are mapped whole. A measurement that makes no commit is left out; the log gives the reason.
 
@@ -23,7 +24,7 @@ from pathlib import Path
 from cairn_client.cli.arguments import Subparsers, say, shown_bytes
 from cairn_client.cli.event_lines import Stopping, lines_on_stderr, until_signal
 from cairn_client.cli.range_arguments import add_ranges, integrator_of, returns_line
-from cairn_client.cli.robot_arguments import add_limits, add_map, limits_of, scope_of
+from cairn_client.cli.robot_arguments import add_kept_scans, add_limits, add_map, kept_scans_bytes, limits_of, scope_of
 from cairn_client.cli.robots.replay import default_name, ensure_map
 from cairn_client.folders.spool import Spool, Stop, remember
 from cairn_client.folders.state_folder import is_state_folder
@@ -65,13 +66,7 @@ def add_parser(commands: Subparsers) -> None:
     )
     run.add_argument("--every", type=float, default=5.0, metavar="SECONDS", help="longest pause between syncs (5)")
     add_limits(run)
-    run.add_argument(
-        "--keep-scans",
-        type=float,
-        default=0.0,
-        metavar="MB",
-        help="size of the newest scans kept in the robot's folder, so that a program can correct their poses (0)",
-    )
+    add_kept_scans(run)
     run.add_argument(
         "--carry",
         type=float,
@@ -87,9 +82,11 @@ def add_parser(commands: Subparsers) -> None:
 def _run(args: argparse.Namespace) -> int:
     if args.every <= 0:
         raise BadInputError("bad_option", f"--every takes seconds above 0, got {args.every:g}")
-    if args.carry < 0 or args.keep_scans < 0:
-        raise BadInputError("bad_option", "--carry and --keep-scans take megabytes of 0 or more")
-    limits_of(args)  # before it waits for the first recording
+    if args.carry < 0:
+        raise BadInputError("bad_option", "--carry takes megabytes of 0 or more")
+    # Before it waits for the first recording.
+    limits_of(args)
+    kept_scans_bytes(args)
     spool, tally = Spool(args.spool), _Tally()
     with until_signal() as stopping:
         robot = _robot(args, spool, stopping)
@@ -135,7 +132,7 @@ def _robot(args: argparse.Namespace, spool: Spool, stopping: Stopping) -> Robot 
         limits=limits_of(args),
         link=args.link,
         stay=args.stay,
-        keep_scans_bytes=round(args.keep_scans * 1e6),
+        keep_scans_bytes=kept_scans_bytes(args),
         carry_bytes_max=round(args.carry * 1e6),
     )
 
@@ -163,10 +160,8 @@ def _map_what_came(robot: Robot, spool: Spool, args: argparse.Namespace, tally: 
 def _leave_out(robot: Robot, stop: Stop, exc: BadInputError) -> None:
     """Nothing can be made of a measurement: go on without it."""
     log.error(
-        "measurement %d of %s is left out: %s; put its scans into the spool again, under a new name and in smaller "
-        "measurements",
-        stop.number,
-        stop.folder,
+        "%s are left out: %s; put them into the spool again, under a new name and in smaller measurements",
+        stop.name,
         exc.message,
     )
     robot.discard()

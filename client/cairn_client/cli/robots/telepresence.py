@@ -34,12 +34,11 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_client.cli.arguments import add_token, api_of, parser, say
-from cairn_client.cli.frame_arguments import add_frame_arguments, frame_options
 from cairn_client.cli.maps.overlay_drawing import MapOverlay
 from cairn_client.cli.robot_arguments import add_spread_arguments, spread_of
+from cairn_client.cli.source_arguments import add_source_arguments, asked_source
 from cairn_client.folders.map_folder import map_of_folder
 from cairn_client.http.api import MapApi
-from cairn_fusion.importers import open_source
 from cairn_fusion.recording.images import write_colour
 from cairn_fusion.recording.recording import ScanSource
 from cairn_fusion.view.mjpeg import Latest
@@ -67,7 +66,7 @@ MAP = "map"
 def main(argv: list[str]) -> int:
     """Write pictures, or serve them."""
     args = _parser().parse_args(argv)
-    source = open_source(args.recording, options=frame_options(args), frames=args.frames)
+    source = asked_source(args.recording, args)
     telepresence = _pictures(source, args)
     if args.serve is not None:
         _serve(source, telepresence, args)
@@ -256,7 +255,7 @@ def _rate(text: str) -> float:
 
 def _parser() -> argparse.ArgumentParser:
     options = parser("cairn telepresence", __doc__)
-    options.add_argument("recording", type=Path, help="a recording, a bag, or a folder of frames")
+    options.add_argument("recording", type=Path, help="a recording, a bag, or a folder of frames or clouds")
     where = options.add_mutually_exclusive_group(required=True)
     where.add_argument("--output", type=Path, metavar="PNG|FOLDER", help="one picture, or a folder with one a scan")
     where.add_argument(
@@ -282,7 +281,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     options.add_argument("--no-marker", action="store_true", help="do not mark the hottest place")
     options.add_argument("--rate", type=_rate, default=RATE_HZ, metavar="HZ", help=f"pictures a second ({RATE_HZ:g})")
-    add_frame_arguments(options)
+    add_source_arguments(options, scale=("--pose-scale",))
     return options
 
 

@@ -67,8 +67,12 @@ class _Joined:
             self._parts.append(data)
 
     def get_write_buffer_size(self) -> int:
-        """Bytes that wait to be sent."""
-        return self._transport.get_write_buffer_size() + sum(map(len, self._parts))
+        """Bytes that wait to be sent; none of a connection that is lost."""
+        try:
+            waiting = self._transport.get_write_buffer_size()
+        except AttributeError:  # a TLS transport that was lost knows no protocol any more
+            return 0
+        return waiting + sum(map(len, self._parts))
 
     def close(self) -> None:
         """Send all that was written, and close."""
@@ -261,6 +265,17 @@ class ListenerProtocol(WebSocketsSansIOProtocol):
                 return
         self._seen_s = self._seen_s or self.loop.time()
         super().data_received(data)
+
+    def send_receive_event_to_app(self) -> None:
+        """Cut a link whose text is none: uvicorn would write a traceback for each."""
+        try:
+            if self.curr_msg_data_type == "text":
+                b"".join(self.frames).decode()
+        except UnicodeDecodeError:
+            log.info("%s: cut, a listener sends a text that is not UTF-8", self.client)
+            self.transport.abort()
+            return
+        super().send_receive_event_to_app()
 
 
 def protocol_of(settings: Settings, places: ConnectionPlaces) -> type[PunctualProtocol]:

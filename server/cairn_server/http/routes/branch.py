@@ -170,4 +170,5 @@ def list_keys(service: Operations, row: Map) -> RobotKeyList:
 @router.put("/maps/{name}/keys/{author}", status_code=204)
 def admit(author: str, service: Operations, row: Map, caller: Operator) -> None:
     """Admit a robot's other key, by an operator's word."""
+    service.acts.take(caller.name, is_admin=caller.role is Role.ADMIN)
     service.sync.admissions.admit(row, author_from_text(author), by=caller)

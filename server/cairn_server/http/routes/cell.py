@@ -20,7 +20,7 @@ from cairn_server.http.routes.documentation import answers, body, problems
 from cairn_server.http.routes.problems import answer_to
 from cairn_server.store.store_rows import Head, MapRow
 from cairn_server.views.cell_views import BUNDLE_MEDIA_TYPE, media_type_of
-from cairn_server.views.voxel_report import asked_voxel
+from cairn_server.views.voxel_report import asked_voxel, voxel_at
 
 ONE_RANGE = re.compile(r"bytes=[ \t]*(\d{0,18})-(\d{0,18})[ \t]*", re.ASCII | re.IGNORECASE)
 """One range of bytes; a request for several, or for none, is answered with the whole, as RFC 9110 allows."""
@@ -42,16 +42,19 @@ def cell_index(
     limit: Annotated[int, Query(ge=1, le=INDEX_PAGE_MAX)] = INDEX_PAGE,
     hottest: Annotated[bool, Query(description="each entry has hottest_k, too")] = False,
     held: Annotated[bool, Query(description="each entry has held_lm, too")] = False,
+    since: Annotated[
+        str | None, Query(max_length=128, description="cursor: the header's vector names only what was folded since")
+    ] = None,
 ) -> CellIndex:
     """Cells that were ever touched, all or those in a box, a page at a time."""
     page = IndexPage(
         after=cell_key(cell_from_text(after)) if after is not None else None,
         limit=limit,
-        inside=box_from_text(box) if box is not None else None,
+        box=box_from_text(box) if box is not None else None,
         is_hottest_asked=hottest,
         is_held_asked=held,
     )
-    return service.sync.replies.cell_index(row, author_from_text(author) if author else None, page)
+    return service.sync.replies.cell_index(row, author_from_text(author) if author else None, page, since=since)
 
 
 @router.get(
@@ -83,6 +86,14 @@ def vector(service: Operations, row: Map, at: Annotated[str, Query(max_length=12
 def voxel(voxel: str, service: Operations, row: Map) -> VoxelAnswer:
     """One voxel of the lattice: its exact numbers, and the commits that saw it."""
     return asked_voxel(service.store, service.cells, row, voxel)
+
+
+@router.get("/maps/{name}/main/voxels", dependencies=READERS)
+def voxel_of_point(
+    service: Operations, row: Map, at: Annotated[str, Query(description="x,y,z: metres, map frame")]
+) -> VoxelAnswer:
+    """The voxel in which a point lies: as the one by its numbers."""
+    return asked_voxel(service.store, service.cells, row, voxel_at(row.geometry, at))
 
 
 @router.head(

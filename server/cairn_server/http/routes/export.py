@@ -1,16 +1,17 @@
 """Routes by which a map leaves the server: as a picture, or as a file of points or an octree."""
 
-from contextlib import suppress
 from functools import partial
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi.responses import StreamingResponse
-from starlette.types import Send
+from starlette.types import Receive, Scope, Send
 
 from cairn_map.errors import DeniedError
 from cairn_map.files.export_request import EXPORT_TYPES, ExportRequest, ExportTicket, TicketedExport
 from cairn_map.render.render_request import RenderRequest
+from cairn_server.access.connection_places import ConnectionPlace
+from cairn_server.http.middleware.deadlines import PLACE
 from cairn_server.http.routes.callers import READERS, Asking, Credentials, Map, Operations
 from cairn_server.http.routes.documentation import answers, json_body, problems
 from cairn_server.http.routes.json_bodies import json_of
@@ -25,10 +26,21 @@ router = APIRouter()
 class _Download(StreamingResponse):
     """File on its way, which ends without its end once its token has ended: the connection is cut."""
 
+    _place: ConnectionPlace | None = None
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a request."""
+        self._place = scope.get("state", {}).get(PLACE)
+        await super().__call__(scope, receive, send)
+
     async def stream_response(self, send: Send) -> None:
         """Send the parts."""
-        with suppress(DeniedError):
+        try:
             await super().stream_response(send)
+        except DeniedError:
+            # By itself the answer would be an error in the log. A proxy's connection is left to it.
+            if self._place is not None and self._place.cut is not None:
+                self._place.cut()
 
 
 @router.get(
@@ -45,7 +57,7 @@ def render(
 ) -> Response:
     """The map as a camera at a pose would see it: PNG with a legend, or the values as NPZ; strong ETag."""
     view = service.views.pictures.asked(row, asked, known=if_none_match)
-    headers = {"ETag": view.etag, "Cache-Control": "no-cache", "Cairn-Cursor": str(view.head.cursor)}
+    headers = {"ETag": view.etag, "Cache-Control": "no-cache", "Cairn-Cursor": str(view.head)}
     if view.body is None:
         return Response(status_code=304, headers=headers)
     headers["X-Content-Type-Options"] = "nosniff"
@@ -76,7 +88,7 @@ def export(
         made = while_allowed(service.views.exports.asked(row, asked.request), partial(asker.reader, name))
     headers = {
         "Cache-Control": "no-store",
-        "Cairn-Cursor": str(made.head.cursor),
+        "Cairn-Cursor": str(made.head),
         "Cairn-Points": str(made.count),
         "Content-Disposition": f'attachment; filename="{name}.{asked.format}"',
         "X-Content-Type-Options": "nosniff",

@@ -221,8 +221,16 @@ def _check_origin(socket: WebSocket) -> None:
         DeniedError: kind `foreign_origin`.
     """
     for origin in socket.headers.getlist("Origin"):
-        if urlsplit(origin).netloc != socket.headers.get("Host"):
+        if not origin.isascii() or _host_of(origin) != socket.headers.get("Host"):
             raise DeniedError("foreign_origin", "a page of another site asks; only this server's own pages may listen")
+
+
+def _host_of(origin: str) -> str | None:
+    """Host and port of an origin; None if it is none."""
+    try:
+        return urlsplit(origin).netloc or None
+    except ValueError:
+        return None
 
 
 def _as_text(event: LiveEvent) -> str:

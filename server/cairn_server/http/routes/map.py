@@ -65,6 +65,7 @@ def retract(
     body: Annotated[Retract, json_of(Retract)],
 ) -> Retracted:
     """Undo commits exactly."""
+    service.acts.take(caller.name, is_admin=caller.role is Role.ADMIN)
     return service.sync.retracts.retract(row, body, by=caller)
 
 

@@ -22,9 +22,10 @@ from cairn_server.http.routes.callers import (
 )
 from cairn_server.http.routes.documentation import TAKES_TOKEN, also, answers, body, json_body, problems
 from cairn_server.http.routes.json_bodies import json_of
+from cairn_server.store.replica_notes import BodyPart
 from cairn_server.sync.asked_cells import Asked, asked_of
 from cairn_server.sync.handing_over import found_commit
-from cairn_server.sync.uploads import Part, uploaded_by
+from cairn_server.sync.uploads import uploaded_by
 
 COMMIT_MEDIA_TYPE = "application/vnd.cairn.commit"
 REPLY_MEDIA_TYPE = "application/vnd.cairn.reply"
@@ -136,9 +137,11 @@ async def add_part(
     cairn_signature: Annotated[str | None, Header(max_length=TEXT_MAX)] = None,
 ) -> Upload:
     """Add a part of a commit's bytes; with the last one it is pushed."""
-    part = Part(digest, total, offset, data, cairn_signature)
+    part, uploads = BodyPart(digest, total, offset, data), service.sync.uploads
     try:
-        found, is_new = await run_in_threadpool(service.sync.uploads.add, row, caller, commit, part)
+        found, is_new = await run_in_threadpool(
+            lambda: uploads.add(row, caller, commit, part, signatures=cairn_signature)
+        )
     except ConflictError as exc:
         await run_in_threadpool(service.sync.pushes.note_conflict, row, caller, exc)
         raise

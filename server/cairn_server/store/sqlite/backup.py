@@ -15,8 +15,8 @@ import apsw
 
 from cairn_map.errors import BadInputError, ConflictError, DamagedDataError, NotFoundError
 from cairn_server.store.folder_lock import LOCK_NAME, lock_folder
+from cairn_server.store.sqlite.archive import check_form
 from cairn_server.store.sqlite.ended_tokens import LIST_NAME, copy_list, ended_since
-from cairn_server.store.sqlite.file_form import check_form
 from cairn_server.store.sqlite.schema import STEPS, ensure_schema
 from cairn_server.store.sqlite.store import FILE_NAME
 from cairn_server.store.sqlite.writer import BUSY_MS

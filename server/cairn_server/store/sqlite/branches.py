@@ -1,24 +1,16 @@
-"""Branches in SQLite: their notes, and the last sign of each, gathered so that a crowd's signs are one write."""
+"""Branches in SQLite, and the notes on them."""
 
-import threading
-import time
+import json
 from contextlib import suppress
-from dataclasses import dataclass
 
-from cairn_map.commits.cursor import ENTRY_FOLD
+import apsw
+
+from cairn_map.commits.cursor import ENTRY_FOLD, cursor_from_text
 from cairn_map.commits.ids import Author
 from cairn_map.errors import UnreachableError
 from cairn_server.store.sqlite.readers import Readers
 from cairn_server.store.sqlite.writer import Writer, rows
-from cairn_server.store.store_rows import EntrySize, MapRow
-
-KEEP_S = 10.0
-"""Time between two writes of a branch that only gives signs of life."""
-WRITE_EVERY_S = 1.0
-"""Time between two writes of all branches' signs."""
-ENTRIES_MAX = 10_000
-Key = tuple[int, str]
-"""Key of a branch: number of the map, and name."""
+from cairn_server.store.store_rows import Branch, EntrySize, MapRow
 
 
 class SqliteBranchNotes:
@@ -57,46 +49,14 @@ class SqliteBranchNotes:
         ]
 
 
-@dataclass(frozen=True, slots=True)
-class Sign:
-    """Last sign of one branch."""
-
-    time_s: float
-    cursor: str | None
-
-
-class LastSeen:
-    """Signs of branches that are still to be written, and those that were; thread-safe."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._written: dict[Key, tuple[float, str | None]] = {}
-        self._unwritten: dict[Key, Sign] = {}
-        self._written_s = float("-inf")
-
-    def note(self, map_number: int, name: str, cursor: str | None) -> bool:
-        """Note a sign; True if it is time to write: there is news, and the last write was `WRITE_EVERY_S` ago."""
-        now_s, key = time.monotonic(), (map_number, name)
-        with self._lock:
-            written_s, known = self._written.get(key, (float("-inf"), None))
-            if now_s - written_s >= KEEP_S or cursor not in (None, known):
-                before = self._unwritten.get(key)
-                self._unwritten[key] = Sign(time.time(), cursor or (before.cursor if before else None))
-            return bool(self._unwritten) and now_s - self._written_s >= WRITE_EVERY_S
-
-    def taken(self) -> dict[Key, Sign]:
-        """Take the signs to be written now; they count as written."""
-        now_s = time.monotonic()
-        with self._lock:
-            signs, self._unwritten = self._unwritten, {}
-            if len(self._written) + len(signs) > ENTRIES_MAX:
-                self._written.clear()
-            for key, sign in signs.items():
-                self._written[key] = now_s, sign.cursor or self._written.get(key, (0.0, None))[1]
-            self._written_s = now_s
-            return signs
-
-    def forget(self, map_number: int, name: str) -> None:
-        """Forget a branch whose row is replaced or removed; its signs are `taken` before."""
-        with self._lock:
-            self._written.pop((map_number, name), None)
+def stored_branches(reader: apsw.Connection, row: MapRow, name: str | None = None) -> list[Branch]:
+    """All branches by name, or the one of a name."""
+    query = "SELECT name, mode, sensors, cursor, last_seen_s, incarnation FROM branch WHERE map = ?"
+    if name is None:
+        found = rows(reader, f"{query} ORDER BY name", (row.number,))
+    else:
+        found = rows(reader, f"{query} AND name = ?", (row.number, name))
+    return [
+        Branch(name, mode, tuple(json.loads(sensors)), cursor_from_text(cursor) if cursor else None, seen_s, born)
+        for name, mode, sensors, cursor, seen_s, born in found
+    ]

@@ -1,17 +1,20 @@
 """Writes of commits and folds, each function inside one transaction of the writer."""
 
-import json
 import time
 
 import apsw
 
 from cairn_map.commits.cursor import ENTRY_FOLD
 from cairn_map.errors import ConflictError
+from cairn_server.store.history import KnownVectors, crosses_mark
 from cairn_server.store.sqlite.retention import check_kept, is_retracted, remember_evidence
 from cairn_server.store.sqlite.robot_keys import admit_commit
 from cairn_server.store.sqlite.shares import give_back_sums, note_number, take_sums
+from cairn_server.store.sqlite.snapshot import SqliteSnapshot
+from cairn_server.store.sqlite.tile_rows import TileWriter, mark_at, recount_tile
 from cairn_server.store.sqlite.writer import first
-from cairn_server.store.store_rows import Fold, MapRow, NewCommit
+from cairn_server.store.store_rows import CellRow, Fold, MapRow, NewCommit
+from cairn_server.store.tiles import tile_of
 
 
 def append_commit(connection: apsw.Connection, row: MapRow, commit: NewCommit, *, age_s: float) -> bool:
@@ -74,8 +77,7 @@ def write_fold(connection: apsw.Connection, row: MapRow, fold: Fold, *, age_s: f
     if any(first(connection, query, (step.commit,)) != step.before for step in fold.steps):
         return False
     connection.execute(
-        "UPDATE map SET seq = ?, chain = ?, vector = ? WHERE number = ?",
-        (fold.head.seq, fold.head.chain, json.dumps(fold.vector.to_json()), row.number),
+        "UPDATE map SET seq = ?, chain = ? WHERE number = ?", (fold.head.seq, fold.head.chain, row.number)
     )
     for seq, entry in enumerate(fold.entries, start=fold.base.seq + 1):
         connection.execute(
@@ -104,24 +106,43 @@ def write_fold(connection: apsw.Connection, row: MapRow, fold: Fold, *, age_s: f
         "UPDATE commits SET due_from = ? WHERE number = ?", [(step.after, step.commit) for step in fold.steps]
     )
     _write_cells(connection, row, fold)
+    if crosses_mark(fold.base, fold.head):
+        snapshot = SqliteSnapshot(connection, row.number, row.geometry.digest(), KnownVectors())
+        mark_at(connection, row.number, fold.head.seq, snapshot.vector_at(fold.head.seq))
     return True
 
 
 def _write_cells(connection: apsw.Connection, row: MapRow, fold: Fold) -> None:
-    connection.executemany(
+    query = (
         "INSERT INTO cell (map, cell, lm, digest, fingerprint, voxels, size_bytes, hottest_k, body, stamps)"
         " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)"
         " ON CONFLICT (map, cell) DO UPDATE SET lm = excluded.lm, digest = excluded.digest,"
         " fingerprint = excluded.fingerprint, voxels = excluded.voxels, size_bytes = excluded.size_bytes,"
-        " hottest_k = excluded.hottest_k, body = excluded.body, stamps = excluded.stamps",
-        [
-            (
-                *(row.number, c.key, c.lm, c.digest, c.fingerprint.to_bytes(), c.voxels),
-                *(c.size_bytes, c.hottest_k, c.body, c.stamps),
-            )
-            for c in fold.cells
-        ],
+        " hottest_k = excluded.hottest_k, body = excluded.body, stamps = excluded.stamps"
     )
+    tiles = TileWriter(connection, row.number)
+    for c in fold.cells:
+        tiles.note(c)
+        values = (c.key, c.lm, c.digest, c.fingerprint.to_bytes(), c.voxels, c.size_bytes, c.hottest_k)
+        connection.execute(query, (row.number, *values, c.body, c.stamps))
+    tiles.write(folded=sum(entry.kind == ENTRY_FOLD for entry in fold.entries))
+
+
+def heal_cell(connection: apsw.Connection, row: MapRow, cell: CellRow) -> bool:
+    """Put sound bytes in the place of a damaged cell; False if it changed meanwhile."""
+    query = "SELECT 1 FROM cell INDEXED BY cell_listed WHERE map = ? AND cell = ? AND lm = ?"
+    if not first(connection, query, (row.number, cell.key, cell.lm)):
+        return False
+    connection.execute(
+        "UPDATE cell SET digest = ?, fingerprint = ?, voxels = ?, size_bytes = ?, body = ?, hottest_k = ?"
+        " WHERE map = ? AND cell = ?",
+        (
+            *(cell.digest, cell.fingerprint.to_bytes(), cell.voxels, cell.size_bytes, cell.body, cell.hottest_k),
+            *(row.number, cell.key),
+        ),
+    )
+    recount_tile(connection, row.number, tile_of(cell.key))
+    return True
 
 
 def _repair(connection: apsw.Connection, number: int, commit: NewCommit) -> None:

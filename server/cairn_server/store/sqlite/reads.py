@@ -4,14 +4,19 @@ import json
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 
+import apsw
+
+from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.ids import Author, CommitId
 from cairn_map.evidence.grid import CellKey, Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
+from cairn_server.store.history import KnownVectors
 from cairn_server.store.sqlite.readers import Readers
 from cairn_server.store.sqlite.schema import WAITING
-from cairn_server.store.sqlite.snapshot import SqliteSnapshot, ids_from_text
+from cairn_server.store.sqlite.snapshot import SqliteSnapshot
 from cairn_server.store.sqlite.writer import Values, first, rows
 from cairn_server.store.store_rows import MapRow, StoredCommit
+from cairn_server.store.stored_columns import ids_from_text
 
 
 class SqliteReads:
@@ -19,10 +24,39 @@ class SqliteReads:
 
     def __init__(self, readers: Readers) -> None:
         self._readers = readers
+        self._vectors = KnownVectors()
+        self._maps: dict[int, MapRow] = {}
 
     def maps(self) -> list[MapRow]:
         """All maps, by name."""
         return self.map_rows("ORDER BY name", ())
+
+    def heads(self, maps: Collection[MapRow] | None = None) -> list[tuple[MapRow, Cursor]]:
+        """All maps, or those of these that there are, with their present states."""
+        query = "SELECT number, seal_key, log_id, seq, chain FROM map"
+        with self._readers.reading() as reader:
+            if maps is None:
+                found = rows(reader, f"{query} ORDER BY name")
+            else:
+                among = "WHERE number IN (SELECT value FROM json_each(?))"
+                found = rows(reader, f"{query} {among} ORDER BY name", (json.dumps([row.number for row in maps]),))
+            return [(self._map_row(reader, number, seal_key), Cursor(*cursor)) for number, seal_key, *cursor in found]
+
+    def waiting_maps(self) -> list[MapRow]:
+        """Maps with commits to be folded, or with a retract under way, by name."""
+        waiting = (
+            "SELECT map FROM commits WHERE folded_seq IS NULL AND damaged IS NULL"
+            " UNION SELECT map FROM commits WHERE due_from IS NOT NULL"
+        )
+        return self.map_rows(f"WHERE number IN ({waiting}) ORDER BY name", ())
+
+    def maps_with_evidence(self, *, before_s: float) -> list[MapRow]:
+        """Maps with evidence of commits folded before an age of the store, by name."""
+        kept = (
+            "SELECT 1 FROM commits WHERE commits.map = map.number AND gone = 0 AND cells > 0"
+            " AND folded_seq IS NOT NULL AND folded_age_s < ?"
+        )
+        return self.map_rows(f"WHERE EXISTS ({kept}) ORDER BY name", (before_s,))
 
     def pending(
         self, row: MapRow, *, limit: int, size_bytes_max: int, skip: Collection[int] = ()
@@ -57,23 +91,29 @@ class SqliteReads:
     def snapshot(self, row: MapRow) -> Iterator[SqliteSnapshot]:
         """One state of the map."""
         with self._readers.transaction() as connection:
-            yield SqliteSnapshot(connection, row.number, row.geometry.digest())
+            yield SqliteSnapshot(connection, row.number, row.geometry.digest(), self._vectors)
 
     def map_rows(self, clause: str, values: Values) -> list[MapRow]:
         """Maps that fit a clause of ours."""
-        query = f"SELECT number, name, geometry, sensor_model, seal_key FROM map {clause}"  # noqa: S608 - our own clause
         with self._readers.reading() as reader:
-            found = rows(reader, query, values)
-        return [
-            MapRow(
+            found = rows(reader, f"SELECT number, seal_key FROM map {clause}", values)  # noqa: S608 - our own clause
+            return [self._map_row(reader, number, seal_key) for number, seal_key in found]
+
+    def _map_row(self, reader: apsw.Connection, number: int, seal_key: bytes) -> MapRow:
+        """The map of a number; read once, for a map never changes."""
+        known = self._maps.get(number)
+        # In a store that was restored the number may be another map's.
+        if known is None or known.seal_key != seal_key:
+            query = "SELECT name, geometry, sensor_model FROM map WHERE number = ?"
+            name, geometry, sensor_model = first(reader, query, (number,))
+            known = self._maps[number] = MapRow(
                 number=number,
                 name=name,
                 geometry=Geometry.model_validate_json(geometry),
                 sensor_model=SensorModel.model_validate_json(sensor_model),
                 seal_key=seal_key,
             )
-            for number, name, geometry, sensor_model, seal_key in found
-        ]
+        return known
 
     def _commit(self, clause: str, row: MapRow, commit: CommitId) -> StoredCommit | None:
         found = self._commits(clause, (row.number, *commit.author, commit.n), size_bytes_max=0)

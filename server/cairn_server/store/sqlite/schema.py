@@ -7,6 +7,7 @@ transaction, when a server opens it. `tests/formats` keeps a store of every vers
 import apsw
 
 from cairn_map.errors import BadInputError
+from cairn_server.store.sqlite.tile_rows import fill_tiles
 
 WAITING = (
     "(SELECT number FROM commits WHERE map = ?1 AND folded_seq IS NULL AND damaged IS NULL"
@@ -259,6 +260,34 @@ ALTER TABLE commits ADD COLUMN due_from INTEGER;    -- of a folded retract: firs
 CREATE INDEX commits_due ON commits (map, number) WHERE due_from IS NOT NULL;
 """
 
+TILES = """
+-- What reads of a map may not cost a row for each of its cells or commits; `tile_rows.fill_tiles` computes it.
+CREATE TABLE tile (
+    map INTEGER NOT NULL REFERENCES map,
+    tile INTEGER NOT NULL,          -- of 4^3 cells: their numbers without the last 6 bits
+    lm INTEGER NOT NULL,            -- newest of its cells
+    cells INTEGER NOT NULL,         -- with a known voxel
+    size_bytes INTEGER NOT NULL,    -- of these
+    fingerprint BLOB NOT NULL,      -- sum of its cells'
+    PRIMARY KEY (map, tile)
+) WITHOUT ROWID;
+CREATE INDEX tile_changed ON tile (map, lm);
+ALTER TABLE map ADD COLUMN cells INTEGER NOT NULL DEFAULT 0;        -- these four of all cells
+ALTER TABLE map ADD COLUMN cells_bytes INTEGER NOT NULL DEFAULT 0;
+ALTER TABLE map ADD COLUMN fingerprint BLOB NOT NULL DEFAULT x'';
+ALTER TABLE map ADD COLUMN corners TEXT;                            -- of those with a known voxel, as JSON
+ALTER TABLE map ADD COLUMN folded INTEGER NOT NULL DEFAULT 0;       -- commits in the log
+CREATE TABLE vector_mark (                                          -- at about each thousandth log entry
+    map INTEGER NOT NULL REFERENCES map,
+    seq INTEGER NOT NULL,
+    vector TEXT NOT NULL,           -- ids folded so far, as JSON
+    PRIMARY KEY (map, seq)
+);
+ALTER TABLE map DROP COLUMN vector;
+DROP INDEX commits_folded;
+CREATE INDEX commits_folded ON commits (map, folded_age_s, folded_seq) WHERE folded_seq IS NOT NULL;
+"""
+
 STEPS = (
     FIRST,
     STAMPS,
@@ -274,6 +303,7 @@ STEPS = (
     BRICKS,
     CAPTURED,
     DUE,
+    TILES,
 )
 
 
@@ -295,5 +325,7 @@ def ensure_schema(connection: apsw.Connection) -> None:
     connection.execute("BEGIN IMMEDIATE")
     for step in STEPS[version:]:
         connection.execute(step)
+        if step is TILES:
+            fill_tiles(connection)
     connection.execute(f"PRAGMA user_version = {len(STEPS)}")
     connection.execute("COMMIT")

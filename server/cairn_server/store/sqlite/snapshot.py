@@ -2,64 +2,66 @@
 
 import json
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from functools import lru_cache
+from itertools import compress, islice
 from typing import Any
 
 import apsw
+import numpy as np
 
 from cairn_map.commits.cursor import Cursor, first_chain
-from cairn_map.commits.ids import Author, CommitId, commit_id_from_text
+from cairn_map.commits.ids import Author, CommitId
 from cairn_map.commits.version_vector import EMPTY, VersionVector, version_vector_from_json
-from cairn_map.evidence.fingerprint import fingerprint_from_bytes
-from cairn_map.evidence.grid import CellKey, cell_of_key
+from cairn_map.evidence.fingerprint import Fingerprint
+from cairn_map.evidence.grid import CellKey
 from cairn_map.wire.messages import LogEntry
+from cairn_server.store.history import KnownVectors
 from cairn_server.store.sqlite.failures import damaged_pages
 from cairn_server.store.sqlite.schema import IS_MEASURED
+from cairn_server.store.sqlite.tile_rows import CELL_COLUMNS, IN_TILES, fingerprint_in_box, tiles_changed, totals_of
 from cairn_server.store.sqlite.writer import first, rows
 from cairn_server.store.store_rows import (
     CellRow,
-    CellState,
     ChainedEntry,
     Contribution,
-    Head,
     NamedCommit,
     Selection,
     Totals,
 )
+from cairn_server.store.stored_columns import cell_row, log_entry
+from cairn_server.store.tiles import Box, is_in_box
 
-CELL_COLUMNS = "cell, lm, digest, fingerprint, voxels, size_bytes, gone_seq, hottest_k"
-PARENT, SEEN, PLACE = (
+PARENT, SEEN, PLACE, NOTE = (
     f"CASE WHEN json_valid(CAST(meta AS TEXT)) THEN json_extract(CAST(meta AS TEXT), '$.{path}') END"
-    for path in ("parent", "seen", "scans[#-1].t_map_rig")
+    for path in ("parent", "seen", "scans[#-1].t_map_rig", "note")
 )
-"""SQL of three fields of a commit's meta; NULL, too, if the meta is damaged."""
+"""SQL of four fields of a commit's meta; NULL, too, if the meta is damaged."""
 LOG_COLUMNS = (
     "seq, kind, robot, incarnation, n, sha, size_bytes, cells, captured_first_s, captured_last_s, retracts,"
-    f" {PARENT}, {SEEN}, {PLACE}, via"
+    f" {PARENT}, {SEEN}, {PLACE}, {NOTE}, via"
 )
 
 
 class SqliteSnapshot:
     """`store.Snapshot` over one connection that is inside a read transaction."""
 
-    def __init__(self, connection: apsw.Connection, map_number: int, geometry_digest: bytes) -> None:
+    def __init__(
+        self, connection: apsw.Connection, map_number: int, geometry_digest: bytes, vectors: KnownVectors
+    ) -> None:
         self._connection = connection
         self._map = map_number
         self._geometry_digest = geometry_digest
-        log_id, seq, chain, vector = first(
-            connection, "SELECT log_id, seq, chain, vector FROM map WHERE number = ?", (map_number,)
-        )
-        self._head = Head(cursor=Cursor(log_id, seq, chain), vector=_vector_of_text(vector))
+        self._vectors = vectors
+        self._head = Cursor(*first(connection, "SELECT log_id, seq, chain FROM map WHERE number = ?", (map_number,)))
 
     @property
-    def head(self) -> Head:
+    def head(self) -> Cursor:
         """The state."""
         return self._head
 
     def chain_at(self, seq: int) -> bytes | None:
         """The chain after entry `seq` (0: of the empty log); None if there is no such entry."""
         if seq == 0:
-            return first_chain(self._head.cursor.log_id, self._geometry_digest)
+            return first_chain(self._head.log_id, self._geometry_digest)
         chain: bytes | None = first(
             self._connection, "SELECT chain FROM log WHERE map = ? AND seq = ?", (self._map, seq)
         )
@@ -75,15 +77,35 @@ class SqliteSnapshot:
             )
         return cell_row(row) if row else None
 
-    def cells(self, *, after_seq: int = -1, after_key: int = -1, limit: int | None = None) -> Iterator[CellRow]:
-        """Cells changed after a log entry, of numbers above `after_key`, at most `limit`; without bodies, rising."""
-        found = rows(
-            self._connection,
-            f"SELECT {CELL_COLUMNS} FROM cell WHERE map = ? AND lm > ? AND cell > ? ORDER BY cell LIMIT ?",  # noqa: S608 - constant columns
-            (self._map, after_seq, after_key, -1 if limit is None else limit),
-        )
-        for row in found:
-            yield cell_row(row)
+    def cells(
+        self, *, after_seq: int = -1, after_key: int = -1, limit: int | None = None, box: Box | None = None
+    ) -> Iterator[CellRow]:
+        """Cells changed after a log entry, in a box, of numbers above `after_key`, at most `limit`; no bodies."""
+        at_most = -1 if limit is None else limit
+        if after_seq < 0 and box is None:
+            query = f"SELECT {CELL_COLUMNS} FROM cell WHERE map = ? AND cell > ? ORDER BY cell LIMIT ?"  # noqa: S608
+            found = rows(self._connection, query, (self._map, after_key, at_most))
+            yield from map(cell_row, found)
+            return
+        tiles = tiles_changed(self._connection, self._map, after_seq=after_seq, box=box)
+        query = f"SELECT {CELL_COLUMNS} FROM {IN_TILES} WHERE lm > ? AND cell.cell > ? ORDER BY cell.cell"  # noqa: S608
+        found = rows(self._connection, query, (json.dumps(tiles), self._map, after_seq, after_key))
+        if box is not None:
+            is_asked = is_in_box(np.fromiter((row[0] for row in found), np.uint64, len(found)), box)
+            found = list(compress(found, is_asked.tolist()))
+        yield from map(cell_row, islice(found, limit))
+
+    def cells_of(self, keys: Collection[CellKey]) -> list[CellRow]:
+        """Those of these cells that are stored, without their bodies, by rising number."""
+        query = f"SELECT {CELL_COLUMNS} FROM cell WHERE map = ? AND cell IN (SELECT value FROM json_each(?))"  # noqa: S608
+        found = rows(self._connection, f"{query} ORDER BY cell", (self._map, json.dumps(sorted(keys))))
+        return [cell_row(row) for row in found]
+
+    def fingerprint_sum(self, box: Box | None = None) -> Fingerprint:
+        """Sum of the fingerprints of all cells, or of those in a box."""
+        if box is not None:
+            return fingerprint_in_box(self._connection, self._map, box)
+        return totals_of(self._connection, self._map)[0].fingerprint
 
     def contributions(self, key: CellKey, *, after_seq: int, newest: int | None = None) -> list[Contribution]:
         """Entries after `after_seq` that touch a cell, oldest first, at most so many of the newest."""
@@ -100,12 +122,6 @@ class SqliteSnapshot:
             Contribution(seq, kind, CommitId(Author(robot, incarnation), n), size_bytes)
             for seq, kind, robot, incarnation, n, size_bytes in reversed(found)
         ]
-
-    def cell_states(self, keys: Collection[CellKey]) -> list[CellState]:
-        """Those of these cells that are stored, without their bodies, by rising number."""
-        query = "SELECT cell, lm, digest FROM cell WHERE map = ? AND cell IN (SELECT value FROM json_each(?))"
-        found = rows(self._connection, f"{query} ORDER BY cell", (self._map, json.dumps(sorted(keys))))
-        return [CellState(CellKey(cell), lm, digest) for cell, lm, digest in found]
 
     def named(self, commits: Sequence[CommitId]) -> list[NamedCommit]:
         """State of each of these commits, folded or not, in the same order; no evidence is read."""
@@ -187,14 +203,27 @@ class SqliteSnapshot:
         )
         return _vector(found)
 
-    def folded_before(self, age_s: float) -> VersionVector:
-        """Commits folded before an age of the store."""
-        found = rows(
-            self._connection,
-            "SELECT robot, incarnation, n FROM commits WHERE map = ? AND folded_age_s < ? AND folded_seq IS NOT NULL",
-            (self._map, age_s),
+    def vector_at(self, seq: int) -> VersionVector:
+        """Ids of the commits folded at or before a log entry."""
+        return self._vectors.at(self._map, seq, self)
+
+    def newest_mark(self, seq: int) -> int:
+        """Entry of the newest mark at or before one; 0: there is none."""
+        query = "SELECT seq FROM vector_mark WHERE map = ? AND seq <= ? ORDER BY seq DESC LIMIT 1"
+        return int(first(self._connection, query, (self._map, seq)) or 0)
+
+    def mark(self, seq: int) -> VersionVector:
+        """Vector of the mark at an entry."""
+        query = "SELECT vector FROM vector_mark WHERE map = ? AND seq = ?"
+        return version_vector_from_json(json.loads(first(self._connection, query, (self._map, seq))))
+
+    def seq_before(self, age_s: float) -> int:
+        """Newest log entry with a commit that was folded before an age of the store; 0: there is none."""
+        query = (
+            "SELECT folded_seq FROM commits WHERE map = ? AND folded_age_s < ? AND folded_seq IS NOT NULL"
+            " ORDER BY folded_age_s DESC, folded_seq DESC LIMIT 1"
         )
-        return _vector(found)
+        return int(first(self._connection, query, (self._map, age_s)) or 0)
 
     def log(self, *, after_seq: int, limit: int, names_max: int | None = None) -> list[LogEntry]:
         """Log entries, oldest first: the first one, and as many more as name so many commits together at most."""
@@ -205,8 +234,8 @@ class SqliteSnapshot:
             " WHERE log.map = ? AND seq > ? ORDER BY seq LIMIT ?",
             (self._map, after_seq, limit),
         ):
-            entry = _log_entry(*row)
-            names += len(entry.retracts)
+            entry = log_entry(*row)
+            names += entry.names
             if found and names_max is not None and names > names_max:
                 break
             found.append(entry)
@@ -227,86 +256,16 @@ class SqliteSnapshot:
 
     def totals(self) -> Totals:
         """Sizes."""
-        cells, size = first(
-            self._connection,
-            "SELECT count(*), coalesce(sum(size_bytes), 0) FROM cell WHERE map = ? AND voxels > 0",
-            (self._map,),
+        sums, corners = totals_of(self._connection, self._map)
+        query = (
+            "SELECT folded + (SELECT count(*) FROM commits WHERE map = ?1 AND folded_seq IS NULL AND damaged IS NULL),"
+            " (SELECT count(*) FROM branch WHERE map = ?1) FROM map WHERE number = ?1"
         )
-        keys = rows(self._connection, "SELECT cell FROM cell WHERE map = ? AND voxels > 0", (self._map,))
-        cells_found = [cell_of_key(key) for (key,) in keys]
-        corners = None
-        if cells_found:
-            corners = (
-                (min(c.i for c in cells_found), min(c.j for c in cells_found), min(c.k for c in cells_found)),
-                (max(c.i for c in cells_found), max(c.j for c in cells_found), max(c.k for c in cells_found)),
-            )
-        commits = first(self._connection, "SELECT count(*) FROM commits WHERE map = ?", (self._map,))
-        branches = first(self._connection, "SELECT count(*) FROM branch WHERE map = ?", (self._map,))
-        return Totals(cells=cells, size_bytes=size, commits=commits, branches=branches, corner_cells=corners)
-
-
-def cell_row(columns: tuple[Any, ...]) -> CellRow:
-    """A cell from its columns, body and stamps last or left out."""
-    key, lm, digest, fingerprint, voxels, size_bytes, gone_seq, hottest_k, *rest = columns
-    return CellRow(
-        key=CellKey(key),
-        lm=lm,
-        digest=digest,
-        fingerprint=fingerprint_from_bytes(fingerprint),
-        voxels=voxels,
-        body=rest[0] if rest else b"",
-        stamps=rest[1] if rest else b"",
-        gone_seq=gone_seq,
-        size_bytes=size_bytes,
-        hottest_k=hottest_k,
-    )
-
-
-@lru_cache(maxsize=4)
-def _vector_of_text(text: str) -> VersionVector:
-    """The head's vector: many ask between two folds, and of hundreds of authors it takes longer than the rest."""
-    return version_vector_from_json(json.loads(text))
+        commits, branches = first(self._connection, query, (self._map,))
+        return Totals(
+            cells=sums.cells, size_bytes=sums.size_bytes, commits=commits, branches=branches, corner_cells=corners
+        )
 
 
 def _vector(found: list[tuple[Any, ...]]) -> VersionVector:
     return EMPTY.with_commits(CommitId(Author(robot, incarnation), n) for robot, incarnation, n in found)
-
-
-def ids_from_text(text: str) -> tuple[CommitId, ...]:
-    """Ids separated by spaces."""
-    return tuple(commit_id_from_text(part) for part in text.split())
-
-
-def _log_entry(
-    seq: int,
-    kind: bytes,
-    robot: str,
-    incarnation: str,
-    n: int,
-    sha: bytes,
-    size_bytes: int,
-    cells: int,
-    first_s: float | None,
-    last_s: float | None,
-    retracts: str,
-    parent: str | None,
-    seen: str | None,
-    place: str | None,
-    via: str | None,
-) -> LogEntry:
-    return LogEntry.model_validate(
-        {
-            "seq": seq,
-            "kind": kind.decode(),
-            "id": f"{robot}.{incarnation}.{n}",
-            "sha": sha.hex(),
-            "size_bytes": size_bytes,
-            "cells": cells,
-            "captured_s": None if first_s is None else (first_s, last_s),
-            "retracts": retracts.split(),
-            "parent": parent,
-            "seen": seen,
-            "place_m": json.loads(place) if place else None,
-            "via": via,
-        }
-    )

@@ -13,15 +13,16 @@ from pathlib import Path
 
 import apsw
 
-from cairn_map.commits.cursor import Cursor, cursor_from_text, first_chain
+from cairn_map.commits.cursor import Cursor, first_chain
 from cairn_map.commits.ids import Author, Incarnation, RobotName, new_incarnation
-from cairn_map.errors import BadInputError, ConflictError, NotFoundError, UnreachableError
+from cairn_map.errors import BadInputError, NotFoundError, UnreachableError
 from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.store.admission import OWN_WORD, Grounds
+from cairn_server.store.branch_signs import LastSeen
 from cairn_server.store.folder_lock import lock_folder
-from cairn_server.store.sqlite.branches import LastSeen, SqliteBranchNotes
-from cairn_server.store.sqlite.changes import append_commit, next_number, write_fold
+from cairn_server.store.sqlite.branches import SqliteBranchNotes, stored_branches
+from cairn_server.store.sqlite.changes import append_commit, heal_cell, next_number, write_fold
 from cairn_server.store.sqlite.ended_tokens import LIST_NAME, EndedTokens
 from cairn_server.store.sqlite.failures import disk_full
 from cairn_server.store.sqlite.old_sums import measure_old_sums
@@ -31,6 +32,7 @@ from cairn_server.store.sqlite.retention import forget_evidence
 from cairn_server.store.sqlite.robot_keys import SqliteAdmittedKeys, admit_registration
 from cairn_server.store.sqlite.schema import WAITING, ensure_schema
 from cairn_server.store.sqlite.shares import SqliteShares
+from cairn_server.store.sqlite.tile_rows import fill_tiles
 from cairn_server.store.sqlite.tokens import (
     SqliteAuditLog,
     SqliteTokens,
@@ -39,6 +41,7 @@ from cairn_server.store.sqlite.tokens import (
     write_audit,
 )
 from cairn_server.store.sqlite.writer import Writer, connect, first, rows
+from cairn_server.store.store import check_same_map
 from cairn_server.store.store_age import CLOCKS, AgeMark, Clocks, StoreAge
 from cairn_server.store.store_rows import (
     Backlog,
@@ -66,7 +69,10 @@ FILE_NAME = "cairn.sqlite"
 
 
 class SqliteStore(SqliteReads):
-    """`store.Store` in a folder."""
+    """`store.Store` in a folder, which one process has (`folder_lock`)."""
+
+    leases = None
+    replicas = None
 
     def __init__(self, folder: Path, clocks: Clocks = CLOCKS) -> None:
         """Open or make the store, whose age goes on by these clocks.
@@ -97,7 +103,7 @@ class SqliteStore(SqliteReads):
         self.shares = SqliteShares(self._writer, self._readers)
         self.audit_log = SqliteAuditLog(self._writer, self._readers)
         self.health = SqliteHealth(path, self._writer, self._readers, self.age)
-        self._maps: dict[str, MapRow] = {}  # which never change
+        self._names: dict[str, MapRow] = {}  # of maps, which never change
         self.notes = SqliteBranchNotes(self._writer, self._readers)
 
     def create_map(self, name: str, geometry: Geometry, sensor_model: SensorModel) -> tuple[MapRow, bool]:
@@ -106,14 +112,14 @@ class SqliteStore(SqliteReads):
         def job(connection: apsw.Connection) -> bool:
             found = first(connection, "SELECT geometry, sensor_model FROM map WHERE name = ?", (name,))
             if found:
-                if found != (geometry.model_dump_json(), sensor_model.model_dump_json()):
-                    raise ConflictError("map_exists", f"map {name} exists with another geometry or sensor model")
+                known = Geometry.model_validate_json(found[0]), SensorModel.model_validate_json(found[1])
+                check_same_map(name, known, (geometry, sensor_model))
                 return False
             log_id = secrets.token_bytes(16)
             tops = [0] * (2 + geometry.plane_count)
             connection.execute(
-                "INSERT INTO map (name, geometry, sensor_model, operator, log_id, seq, chain, vector, tops, seal_key)"
-                " VALUES (?, ?, ?, ?, ?, 0, ?, '{}', ?, randomblob(32))",
+                "INSERT INTO map (name, geometry, sensor_model, operator, log_id, seq, chain, tops, seal_key)"
+                " VALUES (?, ?, ?, ?, ?, 0, ?, ?, randomblob(32))",
                 (
                     name,
                     geometry.model_dump_json(),
@@ -131,12 +137,12 @@ class SqliteStore(SqliteReads):
 
     def map(self, name: str) -> MapRow:
         """The map of a name."""
-        kept = self._maps.get(name)
+        kept = self._names.get(name)
         if kept is not None:
             return kept
         found = self.map_rows("WHERE name = ?", (name,))
         if found:
-            self._maps[name] = found[0]
+            self._names[name] = found[0]
             return found[0]
         raise NotFoundError("no_map", f"there is no map {name!r}; `cairn map ls` lists them")
 
@@ -227,13 +233,17 @@ class SqliteStore(SqliteReads):
         """All branches, by name."""
         with suppress(UnreachableError):  # a full disk is no reason not to tell what is known
             self._write_seen().result()
-        query = "SELECT name, mode, sensors, cursor, last_seen_s, incarnation FROM branch WHERE map = ? ORDER BY name"
         with self._readers.reading() as reader:
-            found = rows(reader, query, (row.number,))
-        return [
-            Branch(name, mode, tuple(json.loads(sensors)), cursor_from_text(cursor) if cursor else None, seen_s, born)
-            for name, mode, sensors, cursor, seen_s, born in found
-        ]
+            return stored_branches(reader, row)
+
+    def branch(self, row: MapRow, name: str) -> Branch | None:
+        """One branch as it is stored."""
+        with self._readers.reading() as reader:
+            return next(iter(stored_branches(reader, row, name)), None)
+
+    def recount(self) -> None:
+        """Compute the sums and vectors again that are kept besides cells and log: in a store that was damaged."""
+        self._writer.run(fill_tiles)
 
     def keep_age(self) -> None:
         """Keep the age of the store, for the next start; may be written later."""
@@ -345,17 +355,7 @@ class SqliteHealth:
 
     def heal(self, row: MapRow, cell: CellRow) -> bool:
         """Put sound bytes in the place of a damaged cell; False if it changed meanwhile."""
-        values = (cell.digest, cell.fingerprint.to_bytes(), cell.voxels, cell.size_bytes, cell.body, cell.hottest_k)
-
-        def job(connection: apsw.Connection) -> bool:
-            connection.execute(
-                "UPDATE cell SET digest = ?, fingerprint = ?, voxels = ?, size_bytes = ?, body = ?, hottest_k = ?"
-                " WHERE map = ? AND cell = ? AND lm = ?",
-                (*values, row.number, cell.key, cell.lm),
-            )
-            return connection.changes() > 0
-
-        return self._writer.run(job)
+        return self._writer.run(lambda connection: heal_cell(connection, row, cell))
 
     def probe(self) -> None:
         """Write something that changes nothing, as durably as a commit."""

@@ -34,7 +34,9 @@ def check_claims(row: MapRow, caller: Caller, id_text: str, meta: CommitMeta, *,
     if meta.id != id_text:
         raise BadInputError("other_id", f"the path names {id_text[:96]}, the commit calls itself {meta.id}")
     if meta.geometry != row.geometry.digest().hex():
-        raise BadInputError("other_geometry", f"the commit was made for another grid than map {row.name} has")
+        raise BadInputError(
+            "other_geometry", f"the commit was made for another grid than map {row.name} has ({row.geometry})"
+        )
     authors = {meta.commit_id.author.robot, *(target.author.robot for target in meta.retracted_ids)}
     foreign = sorted(author for author in authors if not caller.may_author(author))
     if foreign:

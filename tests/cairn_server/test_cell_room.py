@@ -9,16 +9,18 @@ import pytest
 import cairn_server
 from cairn_map.errors import UnreachableError
 from cairn_map.evidence.grid import Geometry
-from cairn_server.folding.decoding_room import DECODING_BYTES, DecodingRoom
+from cairn_server.cell_room import DecodingRoom
 
 SERVER = Path(cairn_server.__file__).parent
 STORED = {"stored_evidence", "stored_surfaces", "decode_stored", "sum_of_contributions"}
 DECODERS = STORED | {"decode_cell", "decode_canonical_cell"}
 LARGE = Geometry(depth=8)
+ROOM_BYTES = 300_000_000
+"""Memory for one grid of 256^3 voxels, not for two."""
 
 
 def test_large_cells_are_decoded_one_at_a_time() -> None:
-    room = DecodingRoom(DECODING_BYTES)
+    room = DecodingRoom(ROOM_BYTES)
     most: list[int] = []
 
     def decode() -> None:
@@ -36,14 +38,14 @@ def test_large_cells_are_decoded_one_at_a_time() -> None:
 
 
 def test_a_thread_that_is_inside_enters_again() -> None:
-    room = DecodingRoom(DECODING_BYTES, wait_s=0)
+    room = DecodingRoom(ROOM_BYTES, wait_s=0)
     with room.of_cell(LARGE, 1), room.of_cell(LARGE, 1):
         assert room.taken_bytes == 12 << 24
     assert room.taken_bytes == 0
 
 
 def test_a_cell_that_finds_no_room_in_time_is_busy_and_leaves_nothing_behind() -> None:
-    room = DecodingRoom(DECODING_BYTES, wait_s=0)
+    room = DecodingRoom(ROOM_BYTES, wait_s=0)
     found: list[str] = []
 
     def decode() -> None:
@@ -79,3 +81,20 @@ def test_requests_decode_cells_only_where_they_have_room(name: str) -> None:
                 called = ast.unparse(node.func)
                 is_decoder = called in DECODERS or called.endswith("cache.evidence")
                 assert not is_decoder or id(node) in with_room, f"{path.name}:{node.lineno} decodes without room"
+
+
+def test_folding_decodes_and_encodes_cells_only_where_it_has_room() -> None:
+    tree = ast.parse((SERVER / "folding" / "cell_cache.py").read_text())
+    with_room = {
+        id(inner)
+        for block in ast.walk(tree)
+        if isinstance(block, ast.With) and any("_memory.room" in ast.unparse(item) for item in block.items)
+        for inner in ast.walk(block)
+    }
+    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
+    found = {ast.unparse(call.func): id(call) in with_room for call in calls}
+    assert found["read"]
+    assert found["stored.opened"]
+    assert found["encode_cell"]
+    # And nowhere else is a cell decoded for a fold than in what the cache calls.
+    assert "decode" not in "".join(found)

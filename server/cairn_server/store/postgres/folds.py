@@ -1,0 +1,194 @@
+"""Folds: a compare-and-swap of the map's head, with all that follows from it, in one transaction.
+
+lock the head if it is the fold's base      another folder was faster, or was paused for an hour: nothing is written
+log, touched, commits, accounts             what is folded, and what is taken out
+cells, tiles, totals                        in batches: a fold may be larger than memory
+head, mark, NOTIFY                          one hint for those that wait for news; they ask the head in any case
+"""
+
+from collections.abc import Iterator, Sequence
+
+from cairn_map.commits.cursor import ENTRY_FOLD
+from cairn_server.store.history import KnownVectors, crosses_mark
+from cairn_server.store.postgres.connections import Connection, Connections, first, rows
+from cairn_server.store.postgres.shares import give_back_sums, lock_head
+from cairn_server.store.postgres.snapshot import PgSnapshot
+from cairn_server.store.postgres.tile_rows import PgTileWriter, recount_tile
+from cairn_server.store.store import LEASE_S
+from cairn_server.store.store_rows import CellRow, Fold, MapRow
+from cairn_server.store.tiles import tile_of
+
+CHANNEL = "cairn_fold"
+"""Channel on which a fold notifies: number of the map, and its new seq."""
+BATCH_BYTES = 8 << 20
+"""Bytes of cells that are written by one statement."""
+PUT_CELLS = """
+    INSERT INTO cell (map, cell, lm, digest, fingerprint, voxels, size_bytes, hottest_k, body, stamps)
+    SELECT %s, u.* FROM unnest(
+        %s::bigint[], %s::bigint[], %s::bytea[], %s::bytea[], %s::bigint[], %s::bigint[], %s::float8[], %s::bytea[],
+        %s::bytea[]
+    ) AS u
+    ON CONFLICT (map, layer, cell) DO UPDATE SET lm = excluded.lm, digest = excluded.digest,
+        fingerprint = excluded.fingerprint, voxels = excluded.voxels, size_bytes = excluded.size_bytes,
+        hottest_k = excluded.hottest_k, body = excluded.body, stamps = excluded.stamps"""
+
+CLAIM = """
+WITH wanted AS (SELECT * FROM unnest(%(maps)s::bigint[]) WITH ORDINALITY AS w (map, turn)),
+    own AS (SELECT map FROM wanted JOIN lease USING (map) WHERE holder = %(holder)s),
+    free AS (
+        SELECT map FROM wanted LEFT JOIN lease USING (map)
+        WHERE lease.map IS NULL OR (holder <> %(holder)s AND until < clock_timestamp())
+        ORDER BY turn LIMIT %(new_max)s
+    )
+INSERT INTO lease (map, holder, until)
+SELECT map, %(holder)s, clock_timestamp() + make_interval(secs => %(for_s)s::float8)
+FROM (TABLE own UNION TABLE free) AS claimed ORDER BY map
+ON CONFLICT (map) DO UPDATE SET holder = excluded.holder, until = excluded.until
+WHERE lease.holder = excluded.holder OR lease.until < clock_timestamp()
+RETURNING map
+"""
+"""Rows are written in the order of the maps, so that two that claim at a time do not wait for each other."""
+
+
+def write_fold(connection: Connection, row: MapRow, fold: Fold, *, age_s: float) -> bool:
+    """Cells, entries and head at an age of the store, if head and retracts are still where the fold begins."""
+    query = "SELECT 1 FROM head WHERE map = %s AND seq = %s AND chain = %s FOR NO KEY UPDATE"
+    if first(connection, query, (row.number, fold.base.seq, fold.base.chain)) is None:
+        return False
+    # A part in which no commit was there to be taken out leaves the head where it is.
+    query = "SELECT due_from FROM commits WHERE map = %s AND number = %s"
+    if any(first(connection, query, (row.number, step.commit)) != step.before for step in fold.steps):
+        return False
+    _write_entries(connection, row, fold, age_s)
+    _write_progress(connection, row, fold)
+    tiles = PgTileWriter(connection, row.number)
+    for batch in _batches(fold):
+        tiles.note(batch)
+        _put_cells(connection, row, batch)
+    tiles.write(folded=sum(entry.kind == ENTRY_FOLD for entry in fold.entries))
+    query = "UPDATE head SET seq = %s, chain = %s WHERE map = %s"
+    connection.execute(query, (fold.head.seq, fold.head.chain, row.number))
+    if crosses_mark(fold.base, fold.head):
+        snapshot = PgSnapshot(connection, row.number, row.geometry.digest(), KnownVectors())
+        snapshot.keep_mark(fold.head.seq)
+    if fold.entries:
+        connection.execute("SELECT pg_notify(%s, %s)", (CHANNEL, f"{row.number} {fold.head.seq}"))
+    return True
+
+
+def heal_cell(connection: Connection, row: MapRow, cell: CellRow) -> bool:
+    """Put sound bytes in the place of a damaged cell; False if it changed meanwhile."""
+    lock_head(connection, row)
+    changed = connection.execute(
+        "UPDATE cell SET digest = %s, fingerprint = %s, voxels = %s, size_bytes = %s, body = %s, hottest_k = %s"
+        " WHERE map = %s AND layer = 0 AND cell = %s AND lm = %s",
+        (
+            *(cell.digest, cell.fingerprint.to_bytes(), cell.voxels, cell.size_bytes, cell.body, cell.hottest_k),
+            *(row.number, cell.key, cell.lm),
+        ),
+    )
+    if not changed.rowcount:
+        return False
+    recount_tile(connection, row.number, tile_of(cell.key))
+    return True
+
+
+class PgLeases:
+    """Claims of maps by the processes that fold (`store.FoldLeases`), by the database's clock."""
+
+    def __init__(self, connections: Connections) -> None:
+        self._connections = connections
+
+    def claim(self, maps: Sequence[MapRow], *, holder: str, new_max: int) -> list[MapRow]:
+        """Claim maps: those of this holder, and some that no other one has."""
+        if not maps:
+            return []
+        values = {"maps": [row.number for row in maps], "holder": holder, "new_max": new_max, "for_s": LEASE_S}
+        with self._connections.lent() as connection:
+            claimed = {number for (number,) in rows(connection, CLAIM, values)}
+        return [row for row in maps if row.number in claimed]
+
+    def release(self, *, holder: str) -> None:
+        """End all claims of a holder."""
+        with self._connections.lent() as connection:
+            connection.execute("DELETE FROM lease WHERE holder = %s", (holder,))
+
+
+def _write_entries(connection: Connection, row: MapRow, fold: Fold, age_s: float) -> None:
+    entries = list(enumerate(fold.entries, start=fold.base.seq + 1))
+    if not entries:
+        return
+    values = {
+        "map": row.number,
+        "age_s": age_s,
+        "seqs": [seq for seq, _ in entries],
+        "kinds": [entry.kind for _, entry in entries],
+        "numbers": [entry.commit for _, entry in entries],
+        "chains": [entry.chain for _, entry in entries],
+        "fold": ENTRY_FOLD,
+    }
+    connection.execute(
+        "INSERT INTO log (map, seq, kind, commit_number, chain)"
+        " SELECT %(map)s, u.* FROM unnest(%(seqs)s::bigint[], %(kinds)s::bytea[], %(numbers)s::bigint[],"
+        " %(chains)s::bytea[]) AS u",
+        values,
+    )
+    of_entries = "unnest(%(seqs)s::bigint[], %(kinds)s::bytea[], %(numbers)s::bigint[]) AS e (seq, kind, number)"
+    connection.execute(
+        "INSERT INTO touched (map, layer, cell, seq, kind, robot, incarnation, n, size_bytes)"
+        " SELECT d.map, d.layer, d.cell, e.seq, e.kind, c.robot, c.incarnation, c.n, octet_length(d.body)"
+        f" FROM {of_entries} JOIN commits AS c ON c.map = %(map)s AND c.number = e.number"
+        " JOIN diff AS d ON d.map = c.map AND d.commit_number = c.number",
+        values,
+    )
+    connection.execute(
+        "UPDATE commits SET folded_seq = e.seq, folded_age_s = %(age_s)s"
+        f" FROM {of_entries} WHERE map = %(map)s AND commits.number = e.number AND e.kind = %(fold)s"
+        " AND folded_seq IS NULL",
+        values,
+    )
+    out = [entry.commit for _, entry in entries if entry.kind != ENTRY_FOLD]
+    if out:
+        connection.execute(
+            f"UPDATE commits SET unfolded_seq = e.seq FROM {of_entries}"
+            " WHERE map = %(map)s AND commits.number = e.number AND e.kind <> %(fold)s",
+            values,
+        )
+        give_back_sums(connection, row, out)
+
+
+def _write_progress(connection: Connection, row: MapRow, fold: Fold) -> None:
+    """Ids that are retracted, commits to be set aside, and retracts under way."""
+    if fold.retracted:
+        connection.execute(
+            "INSERT INTO retracted (map, id) SELECT %s, unnest(%s::text[])",
+            (row.number, [str(target) for target in fold.retracted]),
+        )
+    for number, why in fold.damaged:
+        query = "UPDATE commits SET damaged = %s WHERE map = %s AND number = %s"
+        connection.execute(query, (why.replace("\0", "?"), row.number, number))
+    for step in fold.steps:
+        query = "UPDATE commits SET due_from = %s WHERE map = %s AND number = %s"
+        connection.execute(query, (step.after, row.number, step.commit))
+
+
+def _batches(fold: Fold) -> Iterator[list[CellRow]]:
+    """Cells of a fold, some megabytes at a time; each cell is in one batch."""
+    batch: list[CellRow] = []
+    size_bytes = 0
+    for cell in fold.cells:
+        batch.append(cell)
+        size_bytes += len(cell.body) + len(cell.stamps)
+        if size_bytes > BATCH_BYTES:
+            yield batch
+            batch, size_bytes = [], 0
+    if batch:
+        yield batch
+
+
+def _put_cells(connection: Connection, row: MapRow, cells: list[CellRow]) -> None:
+    columns = (
+        (int(c.key), c.lm, c.digest, c.fingerprint.to_bytes(), c.voxels, c.size_bytes, c.hottest_k, c.body, c.stamps)
+        for c in cells
+    )
+    connection.execute(PUT_CELLS, (row.number, *(list(column) for column in zip(*columns, strict=True))))

@@ -1,0 +1,103 @@
+"""State of a store in PostgreSQL, for administrators and probes, and robots' use of their quotas."""
+
+from collections import defaultdict
+from collections.abc import Mapping
+
+from psycopg import errors
+
+from cairn_map.errors import UnreachableError
+from cairn_server.store.postgres.connections import Connection, Connections, first, rows
+from cairn_server.store.postgres.folds import heal_cell
+from cairn_server.store.postgres.schema import IS_WAITING
+from cairn_server.store.postgres.writing_threads import WritingThreads
+from cairn_server.store.store_age import StoreAge
+from cairn_server.store.store_rows import Backlog, CellRow, MapRow, Robot, StoreFigures, Use, relay_of
+
+PROBE_S = 5
+"""Time in which the database writes a probe, unless it does not keep up."""
+MAPS_MAX = 1000
+"""Most maps whose backlogs are listed."""
+
+
+class PgUses:
+    """`store.Uses`."""
+
+    def __init__(self, connections: Connections) -> None:
+        self._connections = connections
+
+    def since(self, time_s: float) -> Mapping[Robot, Use]:
+        """Use by each robot's commits that came at or after a time, and by what each relay handed over."""
+        query = (
+            "SELECT map.map, u.* FROM map CROSS JOIN LATERAL ("
+            " SELECT robot, via, sum(size_bytes)::bigint, sum(cells)::bigint,"
+            " sum(greatest(0, bricks - size_bytes))::bigint"
+            " FROM commits WHERE commits.map = map.map AND received_s >= %s::float8 GROUP BY 1, 2) AS u"
+        )
+        found: defaultdict[Robot, Use] = defaultdict(Use)
+        with self._connections.lent() as connection:
+            for number, robot, via, *sums in rows(connection, query, (time_s,)):
+                found[number, relay_of(via) if via else robot] += Use(*sums)
+        return found
+
+
+class PgHealth:
+    """`store.StoreHealth`."""
+
+    def __init__(self, connections: Connections, threads: WritingThreads, age: StoreAge) -> None:
+        self._connections = connections
+        self._threads = threads
+        self._age = age
+
+    def backlogs(self) -> list[Backlog]:
+        """Commits of every map that are not folded yet, or whose retract is under way."""
+        query = (
+            "SELECT name, waiting.count, oldest.received_age_s FROM map"
+            " CROSS JOIN LATERAL (SELECT count(*) FROM commits"
+            f"   WHERE commits.map = map.map AND {IS_WAITING}) AS waiting"
+            " LEFT JOIN LATERAL (SELECT received_age_s FROM commits"
+            f"   WHERE commits.map = map.map AND {IS_WAITING} ORDER BY number LIMIT 1) AS oldest ON true"
+            " ORDER BY map.map LIMIT %s"
+        )
+        with self._connections.lent() as connection:
+            found = rows(connection, query, (MAPS_MAX,))
+        now_s = self._age.now_s()
+        return [
+            Backlog(name, count, None if oldest_s is None else max(0.0, now_s - oldest_s))
+            for name, count, oldest_s in found
+        ]
+
+    def figures(self) -> StoreFigures:
+        """Sizes and counts."""
+        with self._connections.lent() as connection:
+            size_bytes = first(connection, "SELECT pg_database_size(current_database())")
+        return StoreFigures(
+            size_bytes=size_bytes,
+            ahead_bytes=0,
+            free_bytes=None,
+            queued=self._threads.queued,
+            written=self._connections.written,
+            emptied=0,
+            failures=dict(self._connections.failures),
+        )
+
+    def check_space(self, free_bytes_min: int) -> None:
+        """Nothing: the disk is the database's, which says itself when it is full (`disk_full`)."""
+
+    def heal(self, row: MapRow, cell: CellRow) -> bool:
+        """Put sound bytes in the place of a damaged cell; False if it changed meanwhile."""
+        return self._connections.run(lambda connection: heal_cell(connection, row, cell))
+
+    def probe(self) -> None:
+        """Write something that changes nothing, as durably as a commit."""
+        try:
+            self._connections.run(_rewrite_age)
+        except UnreachableError as exc:
+            if isinstance(exc.__cause__, errors.QueryCanceled):
+                text = f"the database took nothing for {PROBE_S} s"
+                raise UnreachableError("busy", text, retry_after_s=5.0) from exc
+            raise
+
+
+def _rewrite_age(connection: Connection) -> None:
+    connection.execute(f"SET LOCAL statement_timeout TO '{PROBE_S}s'".encode())
+    connection.execute("UPDATE age SET age_s = age_s")

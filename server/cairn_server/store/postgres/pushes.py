@@ -1,0 +1,159 @@
+"""Commits that are kept: in one statement if they are what a robot pushes day by day, else in a transaction.
+
+    fast    the author's next number, a key that is known, room in the account: one statement, one round trip
+    slow    everything else, under the lock of the map's head: new authors, gaps, repeated commits, retracts, refusals
+
+The fast statement writes rows of its robot only, so that no robot waits for another one; nor does it wait for a fold.
+"""
+
+from typing import Any
+
+from psycopg import errors
+
+from cairn_map.commits.ids import Author
+from cairn_map.errors import ConflictError, UnreachableError
+from cairn_server.store.postgres.connections import Connection, Connections, first
+from cairn_server.store.postgres.retention import check_kept, is_retracted, remember_evidence
+from cairn_server.store.postgres.robot_keys import admit_commit
+from cairn_server.store.postgres.schema import NOW_S
+from cairn_server.store.postgres.shares import CHARGE, charge_of, check_charge, lock_head, note_number
+from cairn_server.store.store_rows import MapRow, NewCommit
+
+KEEP = f"""
+    INSERT INTO commits (
+        map, robot, incarnation, n, sha, size_bytes, cells, bricks, meta, captured_first_s, captured_last_s, retracts,
+        rig, signatures, via, regions, tops, received_s, received_age_s
+    )
+    SELECT %(map)s, %(robot)s, %(incarnation)s, %(n)s, %(sha)s, %(size_bytes)s, %(cells)s, %(bricks)s, %(meta)s,
+        %(first_s)s::float8, %(last_s)s::float8, %(retracts)s, %(rig)s::bytea, %(signatures)s, %(via)s,
+        %(regions)s::bigint[], %(tops)s::bigint[], {NOW_S}, %(age_s)s::float8
+    {{source}}
+    RETURNING number"""
+"""SQL that keeps a commit without its diff."""
+FAST = f"""
+WITH next AS (
+    UPDATE author SET top = %(n)s
+    WHERE map = %(map)s AND robot = %(robot)s AND incarnation = %(incarnation)s AND top = %(n)s - 1 AND NOT closed
+        AND EXISTS (
+            SELECT FROM robot_key AS k
+            WHERE k.map = %(map)s AND k.robot = %(robot)s AND k.incarnation = %(incarnation)s
+                AND (k.is_proven OR NOT %(signs)s)
+        )
+    RETURNING 1
+), charged AS ({CHARGE.format(source="next,")}
+), kept AS ({KEEP.format(source="FROM next")}
+), bodies AS (
+    INSERT INTO diff (map, commit_number, cell, body)
+    SELECT %(map)s, kept.number, d.cell, d.body
+    FROM kept, unnest(%(keys)s::bigint[], %(bodies)s::bytea[]) AS d (cell, body)
+)
+SELECT number FROM kept"""
+SLOW_CHARGE = CHARGE.format(source="")
+SLOW_KEEP = KEEP.format(source="")
+
+
+def append_commit(connections: Connections, row: MapRow, commit: NewCommit, *, age_s: float) -> bool:
+    """Keep a commit at an age of the store; False if the same one is kept already. Durable on return."""
+    values = _values(row, commit, age_s)
+    # A server's own commits share an account, and retracts must not miss what is dropped: both take the lock.
+    if not commit.retracts and _append_fast(connections, values):
+        return True
+    return connections.run(lambda connection: append_slowly(connection, row, commit, age_s=age_s))
+
+
+def append_slowly(connection: Connection, row: MapRow, commit: NewCommit, *, age_s: float) -> bool:
+    """Keep a commit of any kind inside a transaction, or refuse it."""
+    lock_head(connection, row)
+    known = first(
+        connection,
+        "SELECT number, sha, damaged, gone FROM commits WHERE map = %s AND robot = %s AND incarnation = %s AND n = %s",
+        (row.number, *commit.id.author, commit.id.n),
+    )
+    if known is not None:
+        number, sha, damaged, gone = known
+        if sha != commit.sha:
+            raise ConflictError("id_taken", f"commit {commit.id} is already here with other bytes")
+        if damaged is not None:
+            _repair(connection, row, number, commit)
+        elif gone and not is_retracted(connection, row, commit.id):
+            remember_evidence(connection, row, number, commit, age_s=age_s)
+            _insert_diff(connection, row, number, commit)
+        return damaged is not None
+    check_kept(connection, row, commit.retracts)
+    admit_commit(connection, row, commit.id.author, commit.grounds)
+    note_number(connection, row, commit.id, is_carried=commit.via is not None)
+    values = _values(row, commit, age_s)
+    if commit.tops:
+        check_charge(connection, row, commit.id, commit.tops)
+        connection.execute(SLOW_CHARGE, values)
+    _insert_diff(connection, row, first(connection, SLOW_KEEP, values), commit)
+    return True
+
+
+def next_number(connection: Connection, row: MapRow, author: Author) -> int:
+    """The number after an author's highest; no other commit takes it while the head is locked."""
+    lock_head(connection, row)
+    query = "SELECT top + 1 FROM author WHERE map = %s AND robot = %s AND incarnation = %s FOR NO KEY UPDATE"
+    return int(first(connection, query, (row.number, *author)) or 0)
+
+
+def _append_fast(connections: Connections, values: dict[str, Any]) -> bool:
+    try:
+        with connections.lent() as connection:
+            is_new = first(connection, FAST, values) is not None
+    except UnreachableError as exc:
+        # No room on the account, or a commit that overtook this one: the slow way says which.
+        if isinstance(exc.__cause__, errors.CheckViolation | errors.UniqueViolation | errors.DeadlockDetected):
+            return False
+        connections.note_failure(exc)
+        raise
+    if is_new:
+        connections.note_written()
+    return is_new
+
+
+def _values(row: MapRow, commit: NewCommit, age_s: float) -> dict[str, Any]:
+    """Values of `FAST`."""
+    robot, incarnation = commit.id.author
+    first_s, last_s = commit.captured_s or (None, None)
+    return {
+        "map": row.number,
+        "robot": robot,
+        "incarnation": incarnation,
+        "n": commit.id.n,
+        "signs": incarnation in commit.grounds.signers,
+        "sha": commit.sha,
+        "size_bytes": commit.size_bytes,
+        "cells": len(commit.diff),
+        "bricks": commit.bricks,
+        "meta": bytes(commit.text),
+        "first_s": first_s,
+        "last_s": last_s,
+        "retracts": " ".join(map(str, commit.retracts)),
+        "rig": commit.rig,
+        "signatures": commit.signatures,
+        "via": commit.via,
+        "age_s": age_s,
+        **_bodies(commit),
+        **charge_of(commit.id, commit.tops, 2 + row.geometry.plane_count),
+    }
+
+
+def _bodies(commit: NewCommit) -> dict[str, Any]:
+    return {"keys": [int(key) for key in commit.diff], "bodies": [bytes(body) for body in commit.diff.values()]}
+
+
+def _repair(connection: Connection, row: MapRow, number: int, commit: NewCommit) -> None:
+    """Fresh bytes for a commit that was set aside."""
+    connection.execute("DELETE FROM diff WHERE map = %s AND commit_number = %s", (row.number, number))
+    query = "UPDATE commits SET damaged = NULL, meta = %s WHERE map = %s AND number = %s"
+    connection.execute(query, (commit.text, row.number, number))
+    _insert_diff(connection, row, number, commit)
+
+
+def _insert_diff(connection: Connection, row: MapRow, number: int, commit: NewCommit) -> None:
+    connection.execute(
+        "INSERT INTO diff (map, commit_number, cell, body) SELECT %(map)s, %(number)s, d.cell, d.body"
+        " FROM unnest(%(keys)s::bigint[], %(bodies)s::bytea[]) AS d (cell, body)",
+        {"map": row.number, "number": number, **_bodies(commit)},
+    )

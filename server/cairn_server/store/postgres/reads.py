@@ -1,0 +1,166 @@
+"""Reads of a PostgreSQL store outside a snapshot: maps, and commits with their evidence."""
+
+from collections import defaultdict
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from cairn_map.commits.cursor import Cursor
+from cairn_map.commits.ids import Author, CommitId
+from cairn_map.evidence.grid import CellKey, Geometry
+from cairn_map.evidence.inverse_sensor_model import SensorModel
+from cairn_server.store.history import KnownVectors
+from cairn_server.store.postgres.connections import Connection, Connections, first, rows
+from cairn_server.store.postgres.retention import is_retracted
+from cairn_server.store.postgres.schema import IS_WAITING
+from cairn_server.store.postgres.snapshot import OF_COMMIT, PgSnapshot
+from cairn_server.store.store_rows import MapRow, StoredCommit
+from cairn_server.store.stored_columns import ids_from_text
+
+
+class PgReads:
+    """The reading half of `store.Store`."""
+
+    def __init__(self, connections: Connections) -> None:
+        self._connections = connections
+        self._vectors = KnownVectors()
+        self._maps: dict[int, MapRow] = {}
+
+    def maps(self) -> list[MapRow]:
+        """All maps, by name."""
+        return self.map_rows("ORDER BY name", ())
+
+    def heads(self, maps: Collection[MapRow] | None = None) -> list[tuple[MapRow, Cursor]]:
+        """All maps, or those of these that there are, with their present states."""
+        query = "SELECT map, seal_key, log_id, seq, chain FROM map JOIN head USING (map)"
+        with self._connections.lent() as connection:
+            if maps is None:
+                found = rows(connection, f"{query} ORDER BY name")
+            else:
+                numbers = [row.number for row in maps]
+                found = rows(connection, f"{query} WHERE map = ANY(%s) ORDER BY name", (numbers,))
+            return [
+                (self._map_row(connection, number, seal_key), Cursor(*cursor)) for number, seal_key, *cursor in found
+            ]
+
+    def waiting_maps(self) -> list[MapRow]:
+        """Maps with commits to be folded, or with a retract under way, by name."""
+        # A look at each map's first waiting commit, and not at all that wait.
+        next_map = f"SELECT map FROM commits WHERE {IS_WAITING} AND map > waiting.map ORDER BY map LIMIT 1"
+        waiting = (
+            f"WITH RECURSIVE waiting AS ((SELECT map FROM commits WHERE {IS_WAITING} ORDER BY map LIMIT 1)"
+            f" UNION ALL SELECT ({next_map}) FROM waiting WHERE waiting.map IS NOT NULL)"
+            " SELECT map FROM waiting WHERE map IS NOT NULL"
+        )
+        return self.map_rows(f"WHERE map IN ({waiting}) ORDER BY name", ())
+
+    def maps_with_evidence(self, *, before_s: float) -> list[MapRow]:
+        """Maps with evidence of commits folded before an age of the store, by name."""
+        kept = (
+            "SELECT FROM commits WHERE commits.map = map.map AND NOT gone AND cells > 0 AND folded_seq IS NOT NULL"
+            " AND folded_age_s < %s::float8"
+        )
+        return self.map_rows(f"WHERE EXISTS ({kept}) ORDER BY name", (before_s,))
+
+    def pending(
+        self, row: MapRow, *, limit: int, size_bytes_max: int, skip: Collection[int] = ()
+    ) -> list[StoredCommit]:
+        """Commits to be folded, in turn of their robots, with their diffs: at most `limit`, and one or within the size.
+
+        First the oldest of each robot, then the second of each. Folded ones whose retract is under way are among them.
+        """
+        turn = "row_number() OVER (PARTITION BY robot ORDER BY number)"
+        clause = (
+            f"map = %(map)s AND {IS_WAITING} AND number <> ALL(%(skip)s::bigint[])"
+            f" ORDER BY {turn}, number LIMIT %(limit)s"
+        )
+        values = {"map": row.number, "skip": sorted(skip), "limit": limit}
+        with self._connections.snapshot() as connection:
+            found = rows(connection, f"SELECT number, size_bytes FROM commits WHERE {clause}", values)
+            numbers: list[int] = []
+            total_bytes = 0
+            for number, size_bytes in found:
+                total_bytes += size_bytes
+                if numbers and total_bytes > size_bytes_max:
+                    break
+                numbers.append(number)
+            return _commits(connection, row, numbers)
+
+    def commit(self, row: MapRow, commit: CommitId) -> StoredCommit | None:
+        """A commit with its diff, folded or not; None if there is none."""
+        return self._commit(row, commit, OF_COMMIT)
+
+    def folded(self, row: MapRow, commit: CommitId) -> StoredCommit | None:
+        """A folded commit with its diff, or None."""
+        return self._commit(row, commit, f"{OF_COMMIT} AND folded_seq IS NOT NULL")
+
+    def is_retracted(self, row: MapRow, commit: CommitId) -> bool:
+        """True if a retract of this id has taken effect, or waits for the commit to come."""
+        with self._connections.lent() as connection:
+            return is_retracted(connection, row, commit)
+
+    @contextmanager
+    def snapshot(self, row: MapRow) -> Iterator[PgSnapshot]:
+        """One state of the map."""
+        with self._connections.snapshot() as connection:
+            yield PgSnapshot(connection, row.number, row.geometry.digest(), self._vectors)
+
+    def map_rows(self, clause: str, values: tuple[Any, ...]) -> list[MapRow]:
+        """Maps that fit a clause of ours."""
+        with self._connections.lent() as connection:
+            found = rows(connection, f"SELECT map, seal_key FROM map {clause}", values)
+            return [self._map_row(connection, number, seal_key) for number, seal_key in found]
+
+    def _map_row(self, connection: Connection, number: int, seal_key: bytes) -> MapRow:
+        """The map of a number; read once, for a map never changes."""
+        known = self._maps.get(number)
+        # In a store that was restored the number may be another map's.
+        if known is None or known.seal_key != seal_key:
+            query = "SELECT name, geometry, sensor_model FROM map WHERE map = %s"
+            name, geometry, sensor_model = first(connection, query, (number,))
+            known = self._maps[number] = MapRow(
+                number=number,
+                name=name,
+                geometry=Geometry.model_validate_json(geometry),
+                sensor_model=SensorModel.model_validate_json(sensor_model),
+                seal_key=seal_key,
+            )
+        return known
+
+    def _commit(self, row: MapRow, commit: CommitId, clause: str) -> StoredCommit | None:
+        with self._connections.snapshot() as connection:
+            query = f"SELECT number FROM commits WHERE {clause}"
+            number = first(connection, query, (row.number, *commit.author, commit.n))
+            return None if number is None else _commits(connection, row, [number])[0]
+
+
+def _commits(connection: Connection, row: MapRow, numbers: list[int]) -> list[StoredCommit]:
+    """Commits of these numbers, in this order, with their diffs."""
+    if not numbers:
+        return []
+    bodies: defaultdict[int, dict[CellKey, bytes]] = defaultdict(dict)
+    query = (
+        "SELECT commit_number, cell, body FROM diff WHERE map = %s AND layer = 0 AND commit_number = ANY(%s)"
+        " ORDER BY cell"
+    )
+    for number, cell, body in rows(connection, query, (row.number, numbers)):
+        bodies[number][CellKey(cell)] = body
+    columns = "number, robot, incarnation, n, sha, meta, retracts, gone, due_from, signatures"
+    query = f"SELECT {columns} FROM commits WHERE map = %s AND number = ANY(%s)"
+    found = {
+        number: StoredCommit(
+            number=number,
+            id=CommitId(Author(*author), n),
+            sha=sha,
+            text=text,
+            retracts=ids_from_text(retracts),
+            diff=bodies[number],
+            gone=gone,
+            signatures=signed,
+            due_from=due_from,
+        )
+        for number, *author, n, sha, text, retracts, gone, due_from, signed in rows(
+            connection, query, (row.number, numbers)
+        )
+    }
+    return [found[number] for number in numbers]

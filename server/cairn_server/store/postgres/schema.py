@@ -1,0 +1,376 @@
+"""Tables of the store in PostgreSQL, step by step, so that servers of one step and the next run together.
+
+    row written by            keyed by
+    directory   anyone        map; token, audit: of the server
+    push        one robot     map, robot ...        author, held, robot_key; commits, diff
+    fold        the folder    map, ...              head, log, touched, retracted, cell, tile, vector_mark
+
+Every key begins with the map, so that maps can be spread over several databases; those of cells have room for a layer.
+No row refers to one of another map, and no cursor comes from a sequence: `number` is a mere handle of a commit. What
+has to be found together is kept in one row, so that no read joins tables by a plan that may be a bad one.
+
+A step that was released never changes. A step expands: programs of the step before it go on working. What only they
+need is dropped by a later step, which names itself as the oldest that may still work (`Step.oldest`).
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import psycopg
+from psycopg import errors
+from psycopg.conninfo import conninfo_to_dict
+
+from cairn_map.commits.ids import SERVERS_OWN
+from cairn_map.errors import BadInputError, CairnError
+from cairn_server.store.postgres.connections import Connection, connect, first
+from cairn_server.store.postgres.failures import opening_failure
+
+SERVER_MIN = 150_000
+"""Oldest PostgreSQL, as its `server_version_num`."""
+STARTS_MAX = 8
+"""Most attempts of servers that start at once on an empty database: one makes the tables, the others wait for it."""
+
+IS_WAITING = "((folded_seq IS NULL AND damaged IS NULL) OR due_from IS NOT NULL)"
+"""SQL of the commits that folding has still to do with."""
+IS_MEASURED = "folded_seq IS NOT NULL AND unfolded_seq IS NULL AND cells > 0 AND captured_last_s <= received_s + 600"
+"""SQL of the commits in the map that say credibly when they were captured; seconds of `CAPTURED_AHEAD_MAX_S`."""
+SERVERS_IN_SQL = ", ".join(f"'{robot}'" for robot in sorted(SERVERS_OWN))
+IS_RESERVE = f"(closed OR robot IN ({SERVERS_IN_SQL}))"
+"""SQL of the authors whose commits are the reserve's."""
+NOW_S = "extract(epoch FROM clock_timestamp())::float8"
+"""SQL of the time of day, UTC seconds since 1970, by the database's clock: the same for all servers."""
+
+FIRST = f"""
+CREATE TABLE map (
+    map bigint GENERATED ALWAYS AS IDENTITY PRIMARY KEY,
+    name text COLLATE "C" NOT NULL UNIQUE,
+    geometry text NOT NULL,
+    sensor_model text NOT NULL,
+    seal_key bytea NOT NULL
+);
+CREATE TABLE head (
+    map bigint PRIMARY KEY,
+    log_id bytea NOT NULL,
+    seq bigint NOT NULL,
+    chain bytea NOT NULL,
+    folded bigint NOT NULL DEFAULT 0,               -- commits in the log
+    cells bigint NOT NULL DEFAULT 0,                -- these four of all cells
+    cells_bytes bigint NOT NULL DEFAULT 0,
+    fingerprint bytea NOT NULL,
+    corners bigint[]                                -- of those with a known voxel: lowest i, j, k, then highest
+) WITH (fillfactor = 50);
+CREATE TABLE author (
+    map bigint,
+    robot text COLLATE "C",
+    incarnation text COLLATE "C",
+    top bigint NOT NULL,                            -- highest number
+    intervals bigint NOT NULL,                      -- of its numbers, folded or not
+    closed boolean NOT NULL DEFAULT false,          -- takes no new commits, and is the reserve's
+    PRIMARY KEY (map, robot, incarnation)
+) WITH (fillfactor = 70);
+CREATE TABLE held (
+    map bigint,
+    account text COLLATE "C",                       -- robot; empty: the reserve
+    region bigint,
+    tops bigint[] NOT NULL,                         -- per plane: largest numbers of its commits here, added up
+    room bigint NOT NULL,                           -- least that a plane may still take
+    part float8 NOT NULL,                           -- of the account's share, of the fullest plane
+    PRIMARY KEY (map, account, region),
+    CONSTRAINT held_has_room CHECK (room >= 0)
+) WITH (fillfactor = 70);
+CREATE INDEX held_much ON held (map, account, part) WHERE part > 0.5;
+CREATE TABLE robot_key (
+    map bigint,
+    robot text COLLATE "C",
+    incarnation text COLLATE "C",
+    is_proven boolean NOT NULL,                     -- it signed something here, so it is a key
+    may_return boolean NOT NULL,                    -- an operator's word waits for its registration
+    since_s float8 NOT NULL,
+    by text NOT NULL,                               -- name of the token that brought it
+    PRIMARY KEY (map, robot, incarnation)
+);
+CREATE TABLE commits (
+    map bigint,
+    robot text COLLATE "C",
+    incarnation text COLLATE "C",
+    n bigint,
+    number bigint GENERATED ALWAYS AS IDENTITY,     -- about the order of arrival
+    sha bytea NOT NULL,
+    size_bytes bigint NOT NULL,
+    cells bigint NOT NULL,
+    bricks bigint NOT NULL,
+    meta bytea NOT NULL,                            -- as pushed
+    captured_first_s float8,
+    captured_last_s float8,
+    retracts text NOT NULL,                         -- ids separated by spaces
+    rig bytea,
+    signatures text,
+    via text,
+    regions bigint[] NOT NULL,                      -- in which its account is charged
+    tops bigint[] NOT NULL,                         -- per region, each plane's largest number
+    received_s float8 NOT NULL,
+    received_age_s float8 NOT NULL,                 -- age of the store when it came, or came again
+    folded_age_s float8 NOT NULL DEFAULT 0,
+    folded_seq bigint,
+    unfolded_seq bigint,                            -- log entry that took it out again
+    due_from bigint,                                -- of a folded retract: first name still to be taken out
+    damaged text,                                   -- why it is set aside
+    gone boolean NOT NULL DEFAULT false,            -- its evidence is not kept any more
+    PRIMARY KEY (map, robot, incarnation, n)
+) WITH (fillfactor = 80);
+CREATE UNIQUE INDEX commits_number ON commits (map, number);
+CREATE INDEX commits_waiting ON commits (map, number) WHERE {IS_WAITING};
+CREATE INDEX commits_retracting ON commits (map, number) WHERE folded_seq IS NULL AND retracts <> '';
+CREATE INDEX commits_folded ON commits (map, folded_age_s, folded_seq) WHERE folded_seq IS NOT NULL;
+CREATE INDEX commits_kept ON commits (map, folded_age_s) WHERE NOT gone AND cells > 0 AND folded_seq IS NOT NULL;
+CREATE INDEX commits_received ON commits (map, received_s);
+CREATE INDEX commits_captured ON commits (map, captured_last_s) WHERE {IS_MEASURED};
+CREATE TABLE diff (
+    map bigint,
+    layer smallint NOT NULL DEFAULT 0,
+    commit_number bigint,
+    cell bigint,
+    body bytea NOT NULL,
+    PRIMARY KEY (map, commit_number, layer, cell)
+);
+CREATE TABLE log (
+    map bigint,
+    seq bigint,
+    kind bytea NOT NULL,
+    commit_number bigint NOT NULL,
+    chain bytea NOT NULL,
+    PRIMARY KEY (map, seq)
+);
+CREATE TABLE touched (                              -- with what a reader asks of each entry, so that nothing is joined
+    map bigint,
+    layer smallint NOT NULL DEFAULT 0,
+    cell bigint,
+    seq bigint,
+    kind bytea NOT NULL,
+    robot text COLLATE "C" NOT NULL,
+    incarnation text COLLATE "C" NOT NULL,
+    n bigint NOT NULL,
+    size_bytes bigint NOT NULL,
+    PRIMARY KEY (map, layer, cell, seq)
+);
+CREATE TABLE retracted (map bigint, id text COLLATE "C", PRIMARY KEY (map, id));
+CREATE TABLE vector_mark (                          -- at about each thousandth log entry
+    map bigint,
+    seq bigint,
+    vector text NOT NULL,                           -- ids folded so far, as JSON
+    PRIMARY KEY (map, seq)
+);
+CREATE TABLE cell (
+    map bigint,
+    layer smallint NOT NULL DEFAULT 0,
+    cell bigint,
+    lm bigint NOT NULL,
+    digest bytea NOT NULL,
+    fingerprint bytea NOT NULL,
+    voxels bigint NOT NULL,
+    size_bytes bigint NOT NULL,
+    gone_seq bigint NOT NULL DEFAULT 0,             -- newest entry of which the evidence is gone
+    hottest_k float8,
+    body bytea NOT NULL,
+    stamps bytea NOT NULL,
+    PRIMARY KEY (map, layer, cell)
+) WITH (fillfactor = 70);
+CREATE TABLE tile (
+    map bigint,
+    layer smallint NOT NULL DEFAULT 0,
+    tile bigint,                                    -- of 4^3 cells: their numbers without the last 6 bits
+    lm bigint NOT NULL,                             -- newest of its cells
+    cells bigint NOT NULL,                          -- with a known voxel
+    size_bytes bigint NOT NULL,                     -- of these
+    fingerprint bytea NOT NULL,                     -- sum of its cells'
+    PRIMARY KEY (map, layer, tile)
+) WITH (fillfactor = 70);
+CREATE INDEX tile_changed ON tile (map, layer, lm);
+-- Already compressed: PostgreSQL would only try again.
+ALTER TABLE diff ALTER body SET STORAGE EXTERNAL;
+ALTER TABLE cell ALTER body SET STORAGE EXTERNAL, ALTER stamps SET STORAGE EXTERNAL;
+CREATE TABLE lease (map bigint PRIMARY KEY, holder text NOT NULL, until timestamptz NOT NULL);
+CREATE TABLE branch (
+    map bigint,
+    name text COLLATE "C",
+    mode text NOT NULL,
+    sensors text NOT NULL,
+    cursor text,
+    last_seen_s float8 NOT NULL,
+    incarnation text NOT NULL,
+    PRIMARY KEY (map, name)
+) WITH (fillfactor = 70);
+CREATE TABLE branch_status (map bigint, name text COLLATE "C", status text NOT NULL, PRIMARY KEY (map, name))
+    WITH (fillfactor = 70);
+CREATE TABLE token (
+    name text COLLATE "C" PRIMARY KEY,
+    role text NOT NULL,
+    map bigint,                                     -- NULL: all maps
+    robot text,
+    hash bytea NOT NULL UNIQUE,                     -- SHA-256 of the secret
+    created_s float8 NOT NULL,
+    created_age_s float8 NOT NULL,
+    expires_s float8,
+    last_used_s float8,
+    used_age_s float8 NOT NULL DEFAULT 0,
+    confirmed boolean NOT NULL DEFAULT true
+);
+CREATE INDEX token_of_robot ON token (map, robot);
+CREATE TABLE audit (
+    stream text,                                    -- each has a chain of its own
+    number bigint,
+    time_s float8 NOT NULL,
+    who text NOT NULL,
+    what text NOT NULL,
+    detail text NOT NULL,
+    chain bytea NOT NULL,
+    PRIMARY KEY (stream, number)
+);
+CREATE TABLE audit_head (stream text PRIMARY KEY, number bigint NOT NULL, chain bytea NOT NULL);
+CREATE TABLE age (one boolean PRIMARY KEY CHECK (one), age_s float8 NOT NULL, wall_s float8 NOT NULL);
+INSERT INTO age VALUES (true, 0, 0);
+"""
+
+REPLICAS = """
+ALTER TABLE branch_status ADD COLUMN heard_s float8 NOT NULL DEFAULT 0;
+-- Not logged: what is lost in them costs bytes or a moment.
+CREATE UNLOGGED TABLE branch_view (
+    map bigint,
+    name text COLLATE "C",
+    media_type text NOT NULL,
+    time_s float8 NOT NULL,
+    data bytea NOT NULL,
+    PRIMARY KEY (map, name)
+) WITH (fillfactor = 50);
+CREATE UNLOGGED TABLE ticket (
+    hash bytea PRIMARY KEY,                         -- SHA-256 of its text
+    map_name text NOT NULL,
+    asked text NOT NULL,
+    holder bytea,
+    until timestamptz NOT NULL
+);
+CREATE UNLOGGED TABLE body (                        -- commits that come in parts
+    map bigint,
+    robot text COLLATE "C",
+    commit text COLLATE "C",
+    digest text NOT NULL,
+    total_bytes bigint NOT NULL,
+    size_bytes bigint NOT NULL,
+    used_at timestamptz NOT NULL,
+    PRIMARY KEY (map, robot, commit)
+);
+CREATE UNLOGGED TABLE body_part (
+    map bigint,
+    robot text COLLATE "C",
+    commit text COLLATE "C",
+    offset_bytes bigint,
+    data bytea NOT NULL,
+    PRIMARY KEY (map, robot, commit, offset_bytes)
+);
+ALTER TABLE branch_view ALTER data SET STORAGE EXTERNAL;
+ALTER TABLE body_part ALTER data SET STORAGE EXTERNAL;
+CREATE UNLOGGED TABLE bucket (
+    name text COLLATE "C" PRIMARY KEY,
+    turns float8 NOT NULL,
+    turned timestamptz NOT NULL
+) WITH (fillfactor = 70);
+CREATE TABLE use_day (
+    map bigint,
+    robot text COLLATE "C",
+    day bigint NOT NULL,
+    size_bytes bigint NOT NULL,
+    cells bigint NOT NULL,
+    bricks bigint NOT NULL,
+    turns float8,                                   -- left of its commits of a minute; NULL: without a bound
+    turned timestamptz NOT NULL,
+    PRIMARY KEY (map, robot)
+) WITH (fillfactor = 50);
+CREATE TABLE handed_over (upstream text, map_name text, age_s float8 NOT NULL, PRIMARY KEY (upstream, map_name));
+CREATE TABLE shared_secret (one boolean PRIMARY KEY CHECK (one), secret bytea NOT NULL);
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One step of the schema."""
+
+    sql: str
+    oldest: int
+    """Number of the oldest step whose programs work on a database that took this one."""
+
+
+STEPS = (Step(FIRST, oldest=1), Step(REPLICAS, oldest=1))
+
+
+def prepare(url: str) -> None:
+    """Make the tables in an empty database, or what an older store lacks of them; all in one transaction.
+
+    Raises:
+        BadInputError: kind `bad_store`: it cannot be reached, is none, or not fit for a store; `store_version`: the
+            store is of a newer cairn.
+    """
+    try:
+        place = place_of(conninfo_to_dict(url))
+    except psycopg.ProgrammingError as exc:  # whose text may quote the password
+        raise BadInputError("bad_store", "the URL of the store is none: postgresql://USER@HOST:PORT/DATABASE") from exc
+    for turn in range(STARTS_MAX):
+        try:
+            with connect(url) as connection, connection.transaction():
+                _check_server(connection, place)
+                _take_steps(connection)
+            return
+        except (errors.UniqueViolation, errors.DuplicateTable) as exc:
+            # Two servers make the first table at the same time: one of them fails, and finds it then.
+            if turn == STARTS_MAX - 1 or isinstance(exc, errors.DuplicateTable):
+                raise opening_failure(exc, place) from exc
+        except CairnError:
+            raise
+        except psycopg.Error as exc:
+            raise opening_failure(exc, place) from exc
+
+
+def place_of(parts: dict[str, Any]) -> str:
+    """Host, port, database and user of a URL, as people may read them: without the password."""
+    user = f"{parts['user']}@" if parts.get("user") else ""
+    port = f":{parts['port']}" if parts.get("port") else ""
+    return f"postgresql://{user}{parts.get('host', 'localhost')}{port}/{parts.get('dbname', '')}"
+
+
+def _check_server(connection: Connection, place: str) -> None:
+    query = (
+        "SELECT current_setting('server_version_num')::bigint, current_setting('server_version'),"
+        " current_setting('server_encoding'), pg_is_in_recovery(), current_setting('synchronous_commit'),"
+        " current_setting('fsync')"
+    )
+    number, version, encoding, is_standby, commits, fsync = first(connection, query)
+    complaint = None
+    if number < SERVER_MIN:
+        complaint = f"it is PostgreSQL {version}; take {SERVER_MIN // 10_000} or newer"
+    elif is_standby:
+        complaint = "it is a standby, which takes no commits; name its primary"
+    elif encoding != "UTF8":
+        complaint = f"its database is in {encoding}; make one with ENCODING 'UTF8'"
+    elif "off" in (commits, fsync):
+        complaint = "synchronous_commit or fsync is off: what was acknowledged could be lost; turn both on"
+    if complaint is not None:
+        raise BadInputError("bad_store", f"cannot keep a store at {place}: {complaint}")
+
+
+def _take_steps(connection: Connection) -> None:
+    connection.execute("CREATE TABLE IF NOT EXISTS cairn_schema (version bigint NOT NULL, oldest bigint NOT NULL)")
+    # Servers that start at once come one after the other from here on.
+    connection.execute("LOCK TABLE cairn_schema IN ACCESS EXCLUSIVE MODE")
+    version, oldest = first(connection, "SELECT version, oldest FROM cairn_schema") or (0, 0)
+    if oldest > len(STEPS):
+        raise BadInputError(
+            "store_version",
+            f"the store has version {version}, which takes a cairn that knows version {oldest}; this one knows "
+            f"versions to {len(STEPS)}: update it",
+        )
+    if version >= len(STEPS):
+        return
+    for step in STEPS[version:]:
+        connection.execute(step.sql.encode())
+    connection.execute("DELETE FROM cairn_schema")
+    newest = max(step.oldest for step in STEPS)
+    connection.execute("INSERT INTO cairn_schema VALUES (%s, %s)", (len(STEPS), newest))

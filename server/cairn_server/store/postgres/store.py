@@ -1,0 +1,183 @@
+"""The store in PostgreSQL: one database, which any number of servers may share (`store.Store`)."""
+
+import logging
+import secrets
+from collections.abc import Callable
+from concurrent.futures import Future
+from contextlib import suppress
+from functools import partial
+
+from cairn_map.commits.cursor import Cursor, first_chain
+from cairn_map.commits.ids import Author
+from cairn_map.errors import NotFoundError, UnreachableError
+from cairn_map.evidence.fingerprint import ZERO
+from cairn_map.evidence.grid import Geometry
+from cairn_map.evidence.inverse_sensor_model import SensorModel
+from cairn_server.store.admission import OWN_WORD, Grounds
+from cairn_server.store.postgres.branches import PgBranches
+from cairn_server.store.postgres.connections import NOTING, Connection, Connections, first
+from cairn_server.store.postgres.folds import PgLeases, write_fold
+from cairn_server.store.postgres.health import PgHealth, PgUses
+from cairn_server.store.postgres.pushes import append_commit, append_slowly, next_number
+from cairn_server.store.postgres.reads import PgReads
+from cairn_server.store.postgres.replica_notes import PgReplicaNotes
+from cairn_server.store.postgres.retention import forget_evidence
+from cairn_server.store.postgres.robot_keys import PgAdmittedKeys
+from cairn_server.store.postgres.schema import prepare
+from cairn_server.store.postgres.shares import PgShares
+from cairn_server.store.postgres.tokens import PgAuditLog, PgTokens
+from cairn_server.store.postgres.writing_threads import WritingThreads
+from cairn_server.store.store import check_same_map
+from cairn_server.store.store_age import CLOCKS, AgeMark, Clocks, StoreAge
+from cairn_server.store.store_rows import Branch, Fold, MapRow, NewCommit
+
+log = logging.getLogger(__name__)
+
+TICK = """
+UPDATE age SET
+    age_s = greatest(
+        %(own_s)s::float8, age_s + CASE WHEN now_s - wall_s BETWEEN 0 AND 150 THEN now_s - wall_s ELSE 0 END
+    ),
+    wall_s = now_s
+FROM (SELECT extract(epoch FROM clock_timestamp())::float8 AS now_s) AS clock
+RETURNING age_s, wall_s
+"""
+"""The age of the store goes on by the time since any server ticked last, by the database's clock: so all servers have
+one age. Time in which none ran does not count, nor does a jump of that clock: each ticks every 60 s."""
+CONNECTIONS = 48
+"""Most connections of one server to the database, which allows 100 by default."""
+NOTING_CONNECTIONS = 12
+"""Most besides for what need not be durable at once."""
+
+
+class PgStore(PgReads):
+    """`store.Store` in a database."""
+
+    def __init__(self, url: str, *, connections: int = CONNECTIONS, clocks: Clocks = CLOCKS) -> None:
+        """Open or make the store, whose age goes on by these clocks.
+
+        Raises:
+            BadInputError: kind `bad_store` or `store_version` (`schema.prepare`).
+        """
+        prepare(url)
+        super().__init__(Connections(url, limit=connections))
+        self._noting = Connections(url, limit=NOTING_CONNECTIONS, settings=NOTING)
+        self._threads = WritingThreads(self._noting)
+        with self._connections.lent() as connection:
+            self.age = StoreAge(AgeMark(*first(connection, TICK, {"own_s": 0.0})), clocks)
+        self.tokens = PgTokens(self._connections, self._threads, self.age)
+        self.keys = PgAdmittedKeys(self._connections)
+        self.uses = PgUses(self._connections)
+        self.shares = PgShares(self._connections)
+        self.audit_log = PgAuditLog(self._connections)
+        self.health = PgHealth(self._connections, self._threads, self.age)
+        self.leases = PgLeases(self._connections)
+        self.notes = PgBranches(self._connections, self._threads)
+        self.replicas = PgReplicaNotes(self._connections, self._noting, self.notes)
+        self._names: dict[str, MapRow] = {}  # of maps, which never change
+
+    def create_map(self, name: str, geometry: Geometry, sensor_model: SensorModel) -> tuple[MapRow, bool]:
+        """The map and whether it is new; an equal one may exist already."""
+        log_id = secrets.token_bytes(16)
+        values = (name, geometry.model_dump_json(), sensor_model.model_dump_json(), secrets.token_bytes(32))
+
+        def job(connection: Connection) -> bool:
+            number = first(
+                connection,
+                "INSERT INTO map (name, geometry, sensor_model, seal_key) VALUES (%s, %s, %s, %s)"
+                " ON CONFLICT (name) DO NOTHING RETURNING map",
+                values,
+            )
+            if number is None:
+                return False
+            connection.execute(
+                "INSERT INTO head (map, log_id, seq, chain, fingerprint) VALUES (%s, %s, 0, %s, %s)",
+                (number, log_id, first_chain(log_id, geometry.digest()), ZERO.to_bytes()),
+            )
+            return True
+
+        is_new = self._connections.run(job)
+        row = self.map(name)
+        check_same_map(name, (row.geometry, row.sensor_model), (geometry, sensor_model))
+        return row, is_new
+
+    def map(self, name: str) -> MapRow:
+        """The map of a name."""
+        kept = self._names.get(name)
+        if kept is not None:
+            return kept
+        found = self.map_rows("WHERE name = %s", (name,))
+        if found:
+            self._names[name] = found[0]
+            return found[0]
+        raise NotFoundError("no_map", f"there is no map {name!r}; `cairn map ls` lists them")
+
+    def append(self, row: MapRow, commit: NewCommit) -> bool:
+        """Keep a commit; True if it is new, False if the same one is kept already. Durable on return."""
+        return append_commit(self._connections, row, commit, age_s=self.age.now_s())
+
+    def submit(self, row: MapRow, commit: NewCommit) -> Future[bool]:
+        """Keep a commit, as `append` does; durable once the answer is there."""
+        return self._threads.submit(partial(self.append, row, commit))
+
+    def append_built(self, row: MapRow, author: Author, build: Callable[[int], NewCommit]) -> NewCommit:
+        """Keep a commit that `build(n)` makes for the author's next number n."""
+
+        def job(connection: Connection) -> NewCommit:
+            commit = build(next_number(connection, row, author))
+            append_slowly(connection, row, commit, age_s=self.age.now_s())
+            return commit
+
+        return self._connections.run(job)
+
+    def forget_evidence(self, row: MapRow, *, before_s: float, limit: int) -> int:
+        """Drop the evidence and the meta of up to `limit` commits folded, and last pushed, before an age; how many."""
+        return self._connections.run(
+            lambda connection: forget_evidence(connection, row, before_s, limit, age_s=self.age.now_s())
+        )
+
+    def fold(self, row: MapRow, fold: Fold) -> bool:
+        """Write a fold if the head is still its base; False (and nothing written) otherwise."""
+        return self._connections.run(lambda connection: write_fold(connection, row, fold, age_s=self.age.now_s()))
+
+    def register(self, row: MapRow, branch: Branch, token_hash: bytes, grounds: Grounds = OWN_WORD) -> None:
+        """Make a branch, or give an existing one a new token, if its name is not bound to another key."""
+        self.notes.register(row, branch, token_hash, grounds, age_s=self.age.now_s())
+        self.tokens.forget_known()
+
+    def seen(self, row: MapRow, name: str, cursor: Cursor | None) -> None:
+        """Note that a branch was heard of, and where it stands; may be written later."""
+        self.notes.seen(row, name, cursor)
+
+    def deregister(self, row: MapRow, name: str) -> None:
+        """Remove a branch and its token."""
+        self.notes.deregister(row, name)
+        self.tokens.forget_known()
+
+    def branches(self, row: MapRow) -> list[Branch]:
+        """All branches, by name."""
+        return self.notes.all(row)
+
+    def branch(self, row: MapRow, name: str) -> Branch | None:
+        """One branch as it is stored."""
+        return self.notes.one(row, name)
+
+    def keep_age(self) -> None:
+        """Keep the age of the store, for the next start; may be written later."""
+        own_s = self.age.now_s()
+        self._threads.note(lambda connection: self.age.follow(first(connection, TICK, {"own_s": own_s})[0]))
+
+    def audit(self, what: str, detail: str) -> None:
+        """Note something that an administrator may have to look into."""
+        log.warning("%s: %r", what, detail)
+        with suppress(UnreachableError):
+            self.audit_log.add("server", what, detail)
+
+    def close(self) -> None:
+        """Finish what was accepted and close."""
+        self.notes.write_seen()
+        self.tokens.write_used()
+        self.keep_age()
+        self._threads.close()
+        self._noting.close()
+        self._connections.close()

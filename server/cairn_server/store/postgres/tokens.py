@@ -1,0 +1,218 @@
+"""Tokens and the audit log in PostgreSQL (`store.Tokens`, `store.AuditLog`)."""
+
+import logging
+import threading
+import time
+from typing import Any
+
+from cairn_map.errors import ConflictError, NotFoundError
+from cairn_map.wire.access_messages import AuditEntry, audit_chain
+from cairn_server.store.postgres.connections import Connection, Connections, first, rows
+from cairn_server.store.postgres.schema import NOW_S
+from cairn_server.store.postgres.writing_threads import WritingThreads
+from cairn_server.store.store_age import StoreAge
+from cairn_server.store.store_rows import MapRow, Token, registration_name
+
+log = logging.getLogger(__name__)
+
+USED_EVERY_S = 10.0
+"""Time between two writes of all tokens' times of last use."""
+KNOWN_S, KNOWN_MAX = 1.0, 4096
+"""Time for which a found token is not looked up again, and most such tokens; robots show one with each push."""
+AUDIT_ROWS_MAX = 100_000
+SERVER_STREAM = "server"
+"""Stream of the lines that are about the server."""
+_SELECT = (
+    "SELECT t.name, t.role, t.map, m.name, t.robot, t.created_s, t.expires_s, t.last_used_s, t.created_age_s,"
+    " t.used_age_s, t.confirmed FROM token t LEFT JOIN map m ON m.map = t.map"
+)
+
+
+class PgTokens:
+    """`store.Tokens`."""
+
+    def __init__(self, connections: Connections, threads: WritingThreads, age: StoreAge) -> None:
+        self._connections = connections
+        self._threads = threads
+        self._age = age
+        self._lock = threading.Lock()
+        self._used: dict[str, tuple[float, float]] = {}
+        """By name: steady time and age of the store when the token was shown last."""
+        self._written_s = float("-inf")
+        self._known: dict[bytes, tuple[Token, float]] = {}
+
+    def forget_known(self) -> None:
+        """Look all tokens up again; called once a change is durable, before it is answered."""
+        self._known = {}
+
+    def add(self, token: Token, secret_hash: bytes) -> None:
+        """Keep a new token."""
+        query = (
+            "INSERT INTO token (name, role, map, robot, hash, created_s, expires_s, created_age_s)"
+            " VALUES (%s, %s, %s, %s, %s, %s, %s, %s) ON CONFLICT (name) DO NOTHING"
+        )
+        values = (token.name, token.role, token.map_number, token.robot, secret_hash, token.created_s, token.expires_s)
+
+        def job(connection: Connection) -> None:
+            if not connection.execute(query, (*values, self._age.now_s())).rowcount:
+                raise ConflictError("token_exists", f"a token {token.name!r} exists; rotate it, or take another name")
+
+        self._connections.run(job)
+
+    def renew(self, name: str, secret_hash: bytes) -> Token:
+        """Give a token another secret."""
+        return self._changed("UPDATE token SET hash = %s, confirmed = true WHERE name = %s", name, secret_hash)
+
+    def remove(self, name: str) -> None:
+        """Forget a token."""
+
+        def job(connection: Connection) -> None:
+            _check_changed(connection.execute("DELETE FROM token WHERE name = %s", (name,)).rowcount, name)
+
+        self._connections.run(job)
+        self.forget_known()
+
+    def confirm(self, name: str) -> Token:
+        """Let a restored token count again."""
+        return self._changed("UPDATE token SET confirmed = true WHERE name = %s", name)
+
+    def all(self) -> list[Token]:
+        """All tokens, by name."""
+        self.write_used()
+        self._threads.flush()
+        with self._connections.lent() as connection:
+            return [_token(row) for row in rows(connection, f"{_SELECT} ORDER BY t.name")]
+
+    def of_hash(self, secret_hash: bytes) -> Token | None:
+        """The token of a secret, as it was at most a second ago, and not before it was changed here."""
+        known = self._known  # what is read before a change must not become known after it
+        token, until_s = known.get(secret_hash, (None, 0.0))
+        if token is not None and time.monotonic() < until_s:
+            return token
+        with self._connections.lent() as connection:
+            found = rows(connection, f"{_SELECT} WHERE t.hash = %s", (secret_hash,))
+        if not found:
+            return None
+        token = _token(found[0])
+        if len(known) >= KNOWN_MAX:
+            known.clear()
+        known[secret_hash] = token, time.monotonic() + KNOWN_S
+        return token
+
+    def used(self, name: str) -> None:
+        """Note that a token was shown just now; written some seconds later."""
+        with self._lock:
+            self._used[name] = time.monotonic(), self._age.now_s()
+            if time.monotonic() - self._written_s < USED_EVERY_S:
+                return
+        self.write_used()
+
+    def write_used(self) -> None:
+        """Write soon what is noted."""
+        with self._lock:
+            noted, self._used = self._used, {}
+            self._written_s = time.monotonic()
+        if not noted:
+            return
+        names = sorted(noted)
+        query = (
+            f"UPDATE token SET last_used_s = {NOW_S} - u.ago_s, used_age_s = u.age_s"
+            " FROM unnest(%s::text[], %s::float8[], %s::float8[]) AS u (name, ago_s, age_s) WHERE token.name = u.name"
+        )
+
+        def job(connection: Connection) -> None:
+            ago_s = [time.monotonic() - noted[name][0] for name in names]
+            connection.execute(query, (names, ago_s, [noted[name][1] for name in names]))
+
+        self._threads.note(job)
+
+    def _changed(self, query: str, name: str, *values: bytes) -> Token:
+        def job(connection: Connection) -> Token:
+            _check_changed(connection.execute(query.encode(), (*values, name)).rowcount, name)
+            return _token(rows(connection, f"{_SELECT} WHERE t.name = %s", (name,))[0])
+
+        token = self._connections.run(job)
+        self.forget_known()
+        return token
+
+
+class PgAuditLog:
+    """`store.AuditLog`."""
+
+    def __init__(self, connections: Connections) -> None:
+        self._connections = connections
+
+    def add(self, who: str, what: str, detail: str) -> None:
+        """One more line; durable on return."""
+        log.info("%s: %s: %r", who, what, detail)
+        self._connections.run(lambda connection: write_audit(connection, SERVER_STREAM, who, what, detail))
+
+    def page(self, *, after: int, limit: int) -> list[AuditEntry]:
+        """Lines numbered above `after`, oldest first."""
+        query = (
+            "SELECT number, time_s, who, what, detail, chain FROM audit WHERE stream = %s AND number > %s"
+            " ORDER BY number LIMIT %s"
+        )
+        with self._connections.lent() as connection:
+            found = rows(connection, query, (SERVER_STREAM, after, limit))
+        return [
+            AuditEntry(number=number, time_s=time_s, who=who, what=what, detail=detail, chain=chain.hex())
+            for number, time_s, who, what, detail, chain in found
+        ]
+
+
+def write_audit(connection: Connection, stream: str, who: str, what: str, detail: str) -> None:
+    """One more line of a stream, chained to its last, inside a transaction; the newest lines are kept."""
+    who, what, detail = (text.replace("\0", "\\0") for text in (who, what, detail))
+    connection.execute("INSERT INTO audit_head VALUES (%s, 0, '') ON CONFLICT DO NOTHING", (stream,))
+    query = f"SELECT number, chain, {NOW_S} FROM audit_head WHERE stream = %s FOR NO KEY UPDATE"
+    last, before, time_s = first(connection, query, (stream,))
+    number = last + 1
+    chain = audit_chain(before, number, time_s, who=who, what=what, detail=detail)
+    connection.execute(
+        "INSERT INTO audit (stream, number, time_s, who, what, detail, chain) VALUES (%s, %s, %s, %s, %s, %s, %s)",
+        (stream, number, time_s, who, what, detail, chain),
+    )
+    query = "UPDATE audit_head SET number = %s, chain = %s WHERE stream = %s"
+    connection.execute(query, (number, chain, stream))
+    connection.execute("DELETE FROM audit WHERE stream = %s AND number <= %s", (stream, number - AUDIT_ROWS_MAX))
+
+
+def put_registration(connection: Connection, row: MapRow, robot: str, secret_hash: bytes, *, age_s: float) -> None:
+    """The token of a registration, inside its transaction; the one of an earlier registration is worth nothing then."""
+    connection.execute(
+        "INSERT INTO token (name, role, map, robot, hash, created_s, created_age_s)"
+        f" VALUES (%s, 'robot', %s, %s, %s, {NOW_S}, %s)"
+        " ON CONFLICT (name) DO UPDATE SET hash = excluded.hash, created_s = excluded.created_s,"
+        " created_age_s = excluded.created_age_s, expires_s = NULL, last_used_s = NULL, used_age_s = 0,"
+        " confirmed = true",
+        (registration_name(row.name, robot), row.number, robot, secret_hash, age_s),
+    )
+
+
+def remove_tokens_of(connection: Connection, row: MapRow, robot: str) -> None:
+    """Forget every token of a robot on a map, inside a transaction."""
+    connection.execute("DELETE FROM token WHERE map = %s AND robot = %s", (row.number, robot))
+
+
+def _token(columns: tuple[Any, ...]) -> Token:
+    *known, created_age_s, used_age_s, is_confirmed = columns
+    name, role, number, map_name, robot, created_s, expires_s, last_used_s = known
+    return Token(
+        name=name,
+        role=role,
+        map_number=number,
+        map_name=map_name,
+        robot=robot,
+        created_s=created_s,
+        expires_s=expires_s,
+        last_used_s=last_used_s,
+        created_age_s=created_age_s,
+        used_age_s=used_age_s,
+        is_confirmed=is_confirmed,
+    )
+
+
+def _check_changed(count: int, name: str) -> None:
+    if not count:
+        raise NotFoundError("no_such_token", f"there is no token {name[:80]!r}; `cairn token list` shows them")

@@ -1,0 +1,70 @@
+"""Rows of a store from the columns that databases keep of them."""
+
+import json
+from typing import Any
+
+from cairn_map.commits.ids import CommitId, commit_id_from_text
+from cairn_map.evidence.fingerprint import fingerprint_from_bytes
+from cairn_map.evidence.grid import CellKey
+from cairn_map.wire.messages import LogEntry
+from cairn_server.store.store_rows import CellRow
+
+
+def cell_row(columns: tuple[Any, ...]) -> CellRow:
+    """A cell from its columns, body and stamps last or left out."""
+    key, lm, digest, fingerprint, voxels, size_bytes, gone_seq, hottest_k, *rest = columns
+    return CellRow(
+        key=CellKey(key),
+        lm=lm,
+        digest=digest,
+        fingerprint=fingerprint_from_bytes(fingerprint),
+        voxels=voxels,
+        body=rest[0] if rest else b"",
+        stamps=rest[1] if rest else b"",
+        gone_seq=gone_seq,
+        size_bytes=size_bytes,
+        hottest_k=hottest_k,
+    )
+
+
+def ids_from_text(text: str) -> tuple[CommitId, ...]:
+    """Ids separated by spaces."""
+    return tuple(commit_id_from_text(part) for part in text.split())
+
+
+def log_entry(
+    seq: int,
+    kind: bytes,
+    robot: str,
+    incarnation: str,
+    n: int,
+    sha: bytes,
+    size_bytes: int,
+    cells: int,
+    first_s: float | None,
+    last_s: float | None,
+    retracts: str,
+    parent: str | None,
+    seen: str | None,
+    place: str | None,
+    note: str | None,
+    via: str | None,
+) -> LogEntry:
+    """A log entry from its columns; the place is JSON."""
+    return LogEntry.model_validate(
+        {
+            "seq": seq,
+            "kind": kind.decode(),
+            "id": f"{robot}.{incarnation}.{n}",
+            "sha": sha.hex(),
+            "size_bytes": size_bytes,
+            "cells": cells,
+            "captured_s": None if first_s is None else (first_s, last_s),
+            "retracts": retracts.split(),
+            "parent": parent,
+            "seen": seen,
+            "place_m": json.loads(place) if place else None,
+            "via": via,
+            "note": note or "",
+        }
+    )

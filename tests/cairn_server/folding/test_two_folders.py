@@ -1,0 +1,117 @@
+"""Processes that fold one store: each map is one's at a time, nothing is folded twice, no dead one is waited for."""
+
+from collections.abc import Iterator
+
+import pytest
+from tests.fixtures.map.made import SMALL
+from tests.fixtures.server.commit_contract import bodies
+from tests.fixtures.server.lease_contract import LeaseContract
+from tests.fixtures.server.live import until
+from tests.fixtures.server.pushes import MOLE, WREN, pushed, read, sum_of
+from tests.fixtures.server.store_contract import new_of
+from tests.memory_store.leases import MemoryLeases
+from tests.memory_store.store import MemoryStore
+
+from cairn_map.evidence.inverse_sensor_model import SensorModel
+from cairn_server.folding.damaged_cells import DamagedCells
+from cairn_server.folding.fold_thread import FoldThread
+from cairn_server.folding.readiness import FoldHealth
+from cairn_server.metrics import ServerFigures
+from cairn_server.store.store import LEASE_S
+from cairn_server.store.store_rows import MapRow
+
+COMMITS = [pushed(n, n, author) for n in range(6) for author in (MOLE, WREN)]
+
+
+class Steady:
+    """A clock that stands still unless it is set."""
+
+    now_s = 0.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+@pytest.fixture
+def clock() -> Steady:
+    return Steady()
+
+
+@pytest.fixture
+def store(clock: Steady) -> Iterator[MemoryStore]:
+    found = MemoryStore(leases=MemoryLeases(clock))
+    yield found
+    found.close()
+
+
+class TestMemoryLeases(LeaseContract):
+    """Of the store in memory."""
+
+    def expire(self, store: MemoryStore) -> None:  # type: ignore[override]
+        assert store.leases is not None and isinstance(store.leases._steady_s, Steady)
+        store.leases._steady_s.now_s += LEASE_S + 1.0
+
+
+def folder(store: MemoryStore, folded: list[tuple[str, int]] | None = None) -> FoldThread:
+    """A thread as each process has one; with a list, it notes the maps that it folds."""
+    return FoldThread(
+        store,
+        FoldHealth(ServerFigures()),
+        DamagedCells(),
+        keep_evidence_s=1e9,
+        on_fold=lambda row: folded.append((row.name, row.number)) if folded is not None else None,
+        may_forget_s=lambda name: 1e9,
+    )
+
+
+def maps_of(store: MemoryStore, count: int) -> list[MapRow]:
+    return [store.create_map(f"hall{n}", SMALL, SensorModel())[0] for n in range(count)]
+
+
+def test_two_that_fold_together_fold_all_once_and_never_a_map_at_the_same_time(store: MemoryStore) -> None:
+    rows, folded = maps_of(store, 40), ([], [])  # type: ignore[var-annotated]
+    folders = [folder(store, each) for each in folded]
+    for commit in COMMITS:
+        for row in rows:
+            store.append(row, new_of(commit))
+        for thread in folders:
+            thread.wake()
+    until(lambda: not store.waiting_maps(), "all is folded")
+    for thread in folders:
+        thread.close()
+    assert not {name for name, _ in folded[0]} & {name for name, _ in folded[1]}, "the clock stands: claims last"
+    for row in rows:
+        assert read(bodies(store, row)) == sum_of(COMMITS)
+        with store.snapshot(row) as snapshot:
+            assert snapshot.head.seq == len(COMMITS)
+
+
+def test_maps_of_one_that_died_are_folded_by_another_when_its_claims_are_over(
+    store: MemoryStore, clock: Steady
+) -> None:
+    rows = maps_of(store, 2)
+    assert store.leases is not None
+    store.leases.claim(rows[:1], holder="dead", new_max=9)
+    for row in rows:
+        store.append(row, new_of(COMMITS[0]))
+    thread = folder(store)
+    until(lambda: store.waiting_maps() == rows[:1], "the free map is folded")
+    clock.now_s += LEASE_S + 1.0
+    until(lambda: not store.waiting_maps(), "the dead one's map is folded, too")
+    thread.close()
+
+
+def test_what_one_folded_while_it_had_lost_its_claim_is_not_folded_twice(store: MemoryStore, clock: Steady) -> None:
+    [row] = maps_of(store, 1)
+    folders = [folder(store) for _ in range(2)]
+    for commit in COMMITS:
+        store.append(row, new_of(commit))
+        clock.now_s += LEASE_S + 1.0  # whoever had it has it no more
+        for thread in folders:
+            thread.wake()
+    until(lambda: not store.waiting_maps(), "all is folded")
+    for thread in folders:
+        thread.close()
+    assert read(bodies(store, row)) == sum_of(COMMITS)
+    with store.snapshot(row) as snapshot:
+        assert snapshot.head.seq == len(COMMITS)

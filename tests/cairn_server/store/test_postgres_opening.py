@@ -1,0 +1,210 @@
+"""A database in PostgreSQL that is opened as a store: tables are made or brought up to date, or it is refused."""
+
+import signal
+import socket
+from collections.abc import Iterator
+from contextlib import closing
+
+import pytest
+from tests.fixtures.map.made import SMALL
+from tests.fixtures.server.commit_contract import bodies, folded_map, new_map
+from tests.fixtures.server.crowd_contract import all_at_once
+from tests.fixtures.server.postgres import PASSWORD, Database, PostgresServer, new_database
+from tests.fixtures.server.pushes import pushed, read, sum_of
+from tests.fixtures.server.store_contract import new_of
+
+from cairn_map.errors import BadInputError, UnreachableError
+from cairn_map.evidence.inverse_sensor_model import SensorModel
+from cairn_server.folding.cell_cache import CellCache
+from cairn_server.folding.folding import fold_pending
+from cairn_server.store.postgres import schema
+from cairn_server.store.postgres.schema import STEPS, Step
+from cairn_server.store.postgres.store import PgStore
+
+pytestmark = [pytest.mark.processes, pytest.mark.slow]
+
+
+@pytest.fixture
+def store(postgres_database: Database) -> Iterator[PgStore]:
+    """A store of one test."""
+    with closing(PgStore(postgres_database.url)) as made:
+        yield made
+
+
+def refusal(url: str) -> BadInputError:
+    """Error with which a URL is refused."""
+    with pytest.raises(BadInputError) as refused:
+        PgStore(url)
+    assert PASSWORD not in refused.value.message and "%20" not in refused.value.message
+    return refused.value
+
+
+def tables(database: Database) -> list[object]:
+    """Names of the tables of a database."""
+    query = "SELECT relname FROM pg_class WHERE relnamespace = 'public'::regnamespace AND relkind = 'r' ORDER BY 1"
+    return [name for (name,) in database.execute(query)]
+
+
+def test_what_is_pending_and_folded_survives_a_new_start(postgres_database: Database) -> None:
+    with closing(PgStore(postgres_database.url)) as store:
+        row = folded_map(store, pushed(0, 0))
+        store.append(row, new_of(pushed(1, 1)))
+        age_s = store.age.now_s()
+    with closing(PgStore(postgres_database.url)) as again:
+        assert again.map(row.name) == row
+        assert [commit.id for commit in again.pending(row, limit=9, size_bytes_max=0)] == [pushed(1, 1).id]
+        assert read(bodies(again, row)) == sum_of([pushed(0, 0)])
+        assert again.age.now_s() >= age_s
+
+
+def test_servers_that_start_at_once_make_the_tables_once(postgres_database: Database) -> None:
+    made: list[PgStore] = []
+    all_at_once([lambda: made.append(PgStore(postgres_database.url))] * 4)
+    assert postgres_database.execute("SELECT version FROM cairn_schema") == [(len(STEPS),)]
+    row = folded_map(made[0], pushed(0, 0))
+    assert {store.map(row.name) for store in made} == {row}
+    for store in made:
+        store.close()
+
+
+def test_a_newer_schema_is_refused_unless_it_says_that_this_program_still_works(
+    store: PgStore, postgres_database: Database
+) -> None:
+    row = new_map(store, pushed(0, 0))
+    postgres_database.execute("UPDATE cairn_schema SET version = 99")
+    with closing(PgStore(postgres_database.url)) as again:
+        assert again.map(row.name) == row
+    postgres_database.execute("UPDATE cairn_schema SET oldest = 98")
+    refused = refusal(postgres_database.url)
+    assert refused.kind == "store_version" and "99" in refused.message and "update" in refused.message
+
+
+def test_a_store_of_the_first_step_takes_those_that_it_lacks(
+    postgres_database: Database, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as old:
+        old.setattr(schema, "STEPS", STEPS[:1])
+        schema.prepare(postgres_database.url)
+    assert postgres_database.execute("SELECT * FROM cairn_schema") == [(1, 1)]
+    with closing(PgStore(postgres_database.url)) as store:
+        folded_map(store, pushed(0, 0))
+    assert postgres_database.execute("SELECT * FROM cairn_schema") == [(len(STEPS), STEPS[-1].oldest)]
+
+
+def test_a_step_that_fails_leaves_the_store_as_it_was(
+    postgres_database: Database, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with closing(PgStore(postgres_database.url)) as store:
+        row = folded_map(store, pushed(0, 0))
+    before = tables(postgres_database)
+    with monkeypatch.context() as wrong:
+        wrong.setattr(schema, "STEPS", (*STEPS, Step("CREATE TABLE half (x int); SELECT 1 / 0", oldest=1)))
+        assert refusal(postgres_database.url).kind == "bad_store"
+    assert tables(postgres_database) == before
+    with closing(PgStore(postgres_database.url)) as store:
+        assert read(bodies(store, row)) == sum_of([pushed(0, 0)])
+
+
+def test_a_database_of_another_program_is_refused_and_left_as_it_is(postgres_database: Database) -> None:
+    postgres_database.execute("CREATE TABLE token (secret text)")
+    refused = refusal(postgres_database.url)
+    assert refused.kind == "bad_store" and "another program" in refused.message
+    assert tables(postgres_database) == ["token"]
+
+
+def test_a_user_without_rights_is_refused_and_nothing_is_made(postgres_database: Database) -> None:
+    name = f"guest_{postgres_database.name}"
+    postgres_database.execute(f"CREATE USER {name} PASSWORD '{PASSWORD}'")
+    refused = refusal(postgres_database.url.replace("//cairn:", f"//{name}:"))
+    assert refused.kind == "bad_store" and "owner" in refused.message
+    assert tables(postgres_database) == []
+
+
+def test_a_database_that_cannot_hold_every_text_is_refused(postgres: PostgresServer) -> None:
+    refused = refusal(new_database(postgres, encoding="SQL_ASCII").url)
+    assert refused.kind == "bad_store" and "UTF8" in refused.message
+
+
+@pytest.mark.parametrize("setting", ["synchronous_commit=off", "default_transaction_read_only=on"])
+def test_a_database_that_would_not_keep_what_is_acknowledged_is_refused(
+    postgres_database: Database, setting: str
+) -> None:
+    refused = refusal(f"{postgres_database.url}?options=-c%20{setting.replace('=', '%3D')}")
+    assert refused.kind == "bad_store"
+    assert tables(postgres_database) == []
+
+
+def test_a_wrong_url_a_wrong_password_and_no_server_are_refused_with_the_next_step(
+    postgres_database: Database,
+) -> None:
+    with closing(socket.socket()) as nowhere:
+        nowhere.bind(("127.0.0.1", 0))
+        closed_port = nowhere.getsockname()[1]
+    port = postgres_database.server.port
+    for url in (
+        f"postgresql://cairn:{PASSWORD.replace(' ', '%20')}@127.0.0.1:{closed_port}/maps",
+        postgres_database.url.replace("cairn:", "cairn:x"),
+        postgres_database.url.replace(postgres_database.name, "no_such_database"),
+    ):
+        refused = refusal(url)
+        assert refused.kind == "bad_store" and "check that it runs" in refused.message
+        assert "127.0.0.1" in refused.message
+    assert refusal(f"postgresql://cairn@127.0.0.1:{port}/maps?no_such=1").kind == "bad_store"
+
+
+def test_a_lost_connection_is_reported_and_the_next_call_has_a_fresh_one(
+    store: PgStore, postgres_database: Database
+) -> None:
+    row = new_map(store, pushed(0, 0))
+    end = "SELECT count(pg_terminate_backend(pid)) FROM pg_stat_activity WHERE application_name = 'cairn'"
+    postgres_database.execute(f"{end} AND datname = current_database()")
+    with pytest.raises(UnreachableError) as refused:
+        store.append(row, new_of(pushed(1, 1)))
+    assert refused.value.kind == "store_failed" and refused.value.retry_after_s
+    assert store.append(row, new_of(pushed(1, 1)))
+
+
+def test_a_snapshot_whose_connection_is_lost_is_reported(store: PgStore, postgres_database: Database) -> None:
+    row = new_map(store)
+    with pytest.raises(UnreachableError), store.snapshot(row) as snapshot:
+        postgres_database.execute(
+            "SELECT count(pg_terminate_backend(pid)) FROM pg_stat_activity"
+            " WHERE application_name = 'cairn' AND datname = current_database()"
+        )
+        list(snapshot.cells())
+    with store.snapshot(row) as snapshot:
+        assert snapshot.head.seq == 0
+
+
+def test_what_was_acknowledged_survives_a_crash_of_the_database(store: PgStore, postgres_database: Database) -> None:
+    commits = [pushed(n, n) for n in range(4)]
+    row = folded_map(store, *commits[:2])
+    for commit in commits[2:]:
+        store.append(row, new_of(commit))
+    postgres_database.server.stop(signal.SIGQUIT)
+    for _ in range(2):
+        with pytest.raises(UnreachableError) as refused:
+            store.maps()
+        assert refused.value.kind == "store_failed"
+    postgres_database.server.start()
+    assert not store.append(row, new_of(commits[3]))
+    assert fold_pending(store, row, CellCache(SMALL), limit=9) == 2
+    assert read(bodies(store, row)) == sum_of(commits)
+
+
+def test_a_closed_store_says_so_and_notes_are_dropped_silently(postgres_database: Database) -> None:
+    store = PgStore(postgres_database.url)
+    row, _ = store.create_map("lab", SMALL, SensorModel())
+    with store.snapshot(row) as snapshot:
+        store.close()
+        assert list(snapshot.cells()) == []
+    store.close()
+    store.audit("late", "no line")
+    store.seen(row, "mole", None)
+    store.notes.put_status(row, "mole", "{}")
+    for call in (store.maps, lambda: store.append(row, new_of(pushed(0, 0)))):
+        with pytest.raises(UnreachableError) as refused:
+            call()
+        assert refused.value.kind == "shutting_down"
+    with pytest.raises(UnreachableError):
+        store.submit(row, new_of(pushed(0, 0)))

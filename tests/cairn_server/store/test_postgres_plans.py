@@ -1,0 +1,132 @@
+"""Plans of the queries in PostgreSQL: none reads through a table that grows with the map.
+
+They are asked for few rows each: for many of them PostgreSQL may rightly read through a table of this size.
+"""
+
+import json
+import re
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from typing import Any
+
+import psycopg
+import pytest
+from tests.fixtures.map.made import SMALL
+from tests.fixtures.server.postgres import Database
+from tests.fixtures.server.pushes import MOLE
+
+from cairn_map.commits.ids import CommitId
+from cairn_map.commits.version_vector import EMPTY
+from cairn_map.evidence.grid import Cell, cell_key
+from cairn_map.evidence.inverse_sensor_model import SensorModel
+from cairn_server.store.postgres import connections, health, reads, retention, snapshot, tile_rows
+from cairn_server.store.postgres.connections import Connection
+from cairn_server.store.postgres.snapshot import PgSnapshot
+from cairn_server.store.postgres.store import PgStore
+from cairn_server.store.store_rows import MapRow
+
+pytestmark = [pytest.mark.processes, pytest.mark.slow]
+
+COMMITS, SIDE = 20_000, 64
+MARK = COMMITS - 50
+KEYS = [cell_key((i, j, 0)) for i in range(SIDE) for j in range(SIDE)]
+FILL = """
+INSERT INTO commits (map, robot, incarnation, n, sha, size_bytes, cells, bricks, meta, retracts, regions, tops,
+    received_s, received_age_s, folded_age_s, folded_seq, captured_last_s)
+SELECT {map}, 'mole', '0123456789abcdef', n, sha256('x'), 9, 1, 0, '', '', '{{}}', '{{}}', n, n, n, n + 1, n
+FROM generate_series(0, {commits} - 1) AS n;
+INSERT INTO log SELECT map, folded_seq, '+', number, substr(sha, 1, 16) FROM commits;
+INSERT INTO diff SELECT map, 0, number, n, 'abc' FROM commits;
+INSERT INTO cell (map, cell, lm, digest, fingerprint, voxels, size_bytes, body, stamps)
+SELECT {map}, key, place * 4, sha256('y'), substr(sha256('z'), 1, 16), 1, 9, 'abc', ''
+FROM unnest('{{{keys}}}'::bigint[]) WITH ORDINALITY AS k (key, place);
+INSERT INTO tile (map, tile, lm, cells, size_bytes, fingerprint)
+SELECT map, cell >> 6, max(lm), count(*), sum(size_bytes), substr(sha256('z'), 1, 16) FROM cell GROUP BY 1, 2;
+INSERT INTO touched SELECT {map}, 0, ('{{{keys}}}'::bigint[])[1 + n % {side}], n + 1, '+', robot, incarnation, n, 9
+FROM commits;
+UPDATE head SET seq = {commits}, folded = {commits}, chain = (SELECT chain FROM log WHERE seq = {commits})
+WHERE map = {map};
+"""
+
+
+@pytest.fixture
+def store(postgres_database: Database) -> Iterator[PgStore]:
+    """A store with a map of thousands of commits and cells."""
+    with closing(PgStore(postgres_database.url)) as made:
+        row, _ = made.create_map("large", SMALL, SensorModel())
+        keys = ",".join(map(str, KEYS))
+        values = {"map": row.number, "commits": COMMITS, "side": SIDE, "keys": keys}
+        with psycopg.connect(postgres_database.url) as connection:
+            connection.execute(FILL.format(**values))  # type: ignore[call-overload]
+            vector = EMPTY.with_commits(CommitId(MOLE, n) for n in range(MARK))
+            mark = (row.number, MARK, json.dumps(vector.to_json()))
+            connection.execute("INSERT INTO vector_mark VALUES (%s, %s, %s)", mark)
+        postgres_database.execute("VACUUM ANALYZE")
+        yield made
+
+
+@pytest.fixture
+def scanned(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Tables of commits and cells that were read through, each with the query."""
+    found: list[str] = []
+
+    def watched(run: Callable[..., Any]) -> Callable[..., Any]:
+        def explained(connection: Connection, query: str, values: Any = ()) -> Any:
+            plan = connection.execute(f"EXPLAIN {query}", values).fetchall()
+            text = "\n".join(line for (line,) in plan)
+            found.extend(
+                f"{table}: {query}" for table in re.findall(r"Seq Scan on (commits|diff|log|touched|cell)\b", text)
+            )
+            return run(connection, query, values)
+
+        return explained
+
+    for module in (health, reads, retention, snapshot, tile_rows):
+        for name in ("rows", "first"):
+            if hasattr(module, name):
+                monkeypatch.setattr(module, name, watched(getattr(connections, name)))
+    return found
+
+
+def test_no_query_of_a_snapshot_reads_through_commits_or_cells(store: PgStore, scanned: list[str]) -> None:
+    row = store.map("large")
+    some = [CommitId(MOLE, n) for n in range(50)]
+    corner = Cell(0, 0, 0)
+    read: list[Callable[[PgSnapshot], object]] = [
+        lambda s: s.vector_at(COMMITS),
+        lambda s: s.vector_at(COMMITS - 30),
+        lambda s: list(s.cells(after_seq=4 * len(KEYS) - 100)),
+        lambda s: list(s.cells(after_seq=5, box=(corner, Cell(4, 4, 0)))),
+        lambda s: s.fingerprint_sum((corner, Cell(7, 8, 0))),
+        lambda s: list(s.cells(after_key=KEYS[9], limit=20)),
+        lambda s: s.cells_of(KEYS[:9]),
+        lambda s: s.cell(KEYS[5]),
+        lambda s: s.contributions(KEYS[5], after_seq=100, newest=9),
+        lambda s: s.named(some),
+        lambda s: s.touched_cells(some),
+        lambda s: s.diff(some[7], KEYS[5]),
+        lambda s: s.tip(MOLE),
+        lambda s: s.newest_captured_s(),
+        lambda s: s.pending(),
+        lambda s: s.seq_before(9000.5),
+        lambda s: s.log(after_seq=COMMITS - 50, limit=20),
+        lambda s: s.chained(after_seq=100, limit=20),
+        lambda s: s.totals(),
+    ]
+    with store.snapshot(row) as found:
+        for each in read:
+            each(found)
+    assert scanned == []
+
+
+def test_no_query_outside_of_snapshots_reads_through_commits(store: PgStore, scanned: list[str]) -> None:
+    row = store.map("large")
+    idle: list[MapRow] = store.waiting_maps()
+    assert idle == [] and store.pending(row, limit=9, size_bytes_max=1) == []
+    store.maps_with_evidence(before_s=9000.0)
+    store.heads()
+    store.commit(row, CommitId(MOLE, 7))
+    store.health.backlogs()
+    store.uses.since(COMMITS - 9.0)
+    store.forget_evidence(row, before_s=9000.0, limit=9)
+    assert scanned == []

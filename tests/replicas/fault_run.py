@@ -1,0 +1,126 @@
+"""One run of faults against a site, and the verdict on its store."""
+
+import random
+import shutil
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import httpx
+from tests.crash.verdict import Verdict, compare
+from tests.fixtures.map.made import SMALL
+from tests.fixtures.server.live import until
+from tests.fixtures.server.postgres import PostgresServer
+from tests.replicas.robots import Pushed, Pusher
+from tests.replicas.site import Site, crash_database, kill_and_start, sleep_through, stop_and_start
+
+from cairn_map.wire.messages import CreateMap
+from cairn_server.folding.store_check import check_map
+from cairn_server.store.postgres.store import PgStore
+
+SILENCE_MAX_S = 15.0
+"""Longest time that robots may wait for any answer to a push after a fault."""
+FAULT_EVERY_S = 5.0
+SLEEP_S = 8.0
+"""More than `store.LEASE_S`."""
+
+
+@dataclass(slots=True)
+class FaultRun:
+    """What came of a run."""
+
+    pushed: Pushed = field(default_factory=Pushed)
+    faults: Counter[str] = field(default_factory=Counter)
+    verdict: Verdict = field(default_factory=Verdict)
+    seconds: float = 0.0
+    folded_after_s: float = 0.0
+    """Time from the last push until all was folded."""
+
+    def rows(self) -> Iterator[tuple[str, str]]:
+        """Lines for people."""
+        pushed = self.pushed
+        yield "acknowledged", f"{len(pushed.acked)} in {self.seconds:.0f} s"
+        yield "faults", ", ".join(f"{count} x {what}" for what, count in sorted(self.faults.items()))
+        yield "answers", ", ".join(f"{count} x {what}" for what, count in sorted(pushed.answers.items()))
+        yield "longest time without an acknowledgement", f"{pushed.silence_s:.1f} s"
+        yield "folded after the last push", f"{self.folded_after_s:.1f} s"
+        yield "lost, wrong", f"{len(self.verdict.lost)}, {self.verdict.wrong + pushed.wrong[:5]}"
+
+
+@contextmanager
+def postgres_in(programs: Path) -> Iterator[PostgresServer]:
+    """A server of PostgreSQL in a folder of its own."""
+    folder = Path(tempfile.mkdtemp(prefix="cairn-postgres-"))
+    try:
+        server = PostgresServer(programs, folder)
+        yield server
+        server.stop()
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def fault_run(
+    folder: Path, programs: Path, *, seconds: float, robots: int, seed: int, folders: int = 2, servers: int = 2
+) -> FaultRun:
+    """Push through servers that are killed, and look at the store."""
+    chance, found = random.Random(seed), FaultRun()
+    with postgres_in(programs) as postgres:
+        postgres.execute("CREATE DATABASE cairn")
+        site = Site(folder, postgres, "cairn")
+        for role in ("server",) * servers + ("folder",) * folders:
+            site.add(role)
+        map_url = f"{site.urls()[0]}/maps/lab"
+        body = CreateMap(geometry=SMALL).model_dump_json()
+        httpx.put(map_url, content=body, headers={"Content-Type": "application/json"}).raise_for_status()
+        _push_under_faults(site, found, chance, seconds=seconds, robots=robots)
+        _judge(site, found)
+        site.close()
+    return found
+
+
+def _push_under_faults(site: Site, found: FaultRun, chance: random.Random, *, seconds: float, robots: int) -> None:
+    ended, start_s = threading.Event(), time.monotonic()
+    found.pushed.last_s = start_s
+    pushers = [Pusher(site, found.pushed, number, ended) for number in range(robots)]
+    try:
+        faults = list(_faults(site))
+        chance.shuffle(faults)
+        for what, act in (faults * 1000)[: max(1, int(seconds / FAULT_EVERY_S))]:
+            threading.Event().wait(FAULT_EVERY_S * chance.uniform(0.3, 0.8))
+            act()
+            found.faults[what] += 1
+            if time.monotonic() - start_s > seconds:
+                break
+        threading.Event().wait(min(FAULT_EVERY_S, max(0.5, seconds - (time.monotonic() - start_s))))
+    finally:
+        ended.set()
+        for pusher in pushers:
+            pusher.thread.join()
+    found.seconds = time.monotonic() - start_s
+
+
+def _faults(site: Site) -> Iterator[tuple[str, Callable[[], None]]]:
+    for member in site.members:
+        yield f"kill -9 of a {member.role}", kill_and_start(site, member)
+        if member.role == "folder":
+            yield f"SIGSTOP of a {member.role}", sleep_through(member, SLEEP_S)
+        else:
+            yield f"replaced {member.role}", stop_and_start(site, member)
+    yield "crash of the database", crash_database(site)
+
+
+def _judge(site: Site, found: FaultRun) -> None:
+    store = PgStore(site.postgres.url(site.database))
+    try:
+        row, last_s = store.map("lab"), time.monotonic()
+        until(lambda: not store.waiting_maps(), "all is folded")
+        found.folded_after_s = time.monotonic() - last_s
+        compare(store, row, list(found.pushed.acked), found.pushed.offered, found.verdict)
+        found.verdict.wrong += [str(each) for each in check_map(store, row, lambda done, total: None).findings]
+    finally:
+        store.close()
