@@ -41,6 +41,11 @@ class FaultRun:
     folded_after_s: float = 0.0
     """Time from the last push until all was folded."""
 
+    @property
+    def is_sound(self) -> bool:
+        """True if nothing was lost, and robots did not wait for long."""
+        return self.verdict.is_sound and not self.pushed.wrong and self.pushed.silence_s <= SILENCE_MAX_S
+
     def rows(self) -> Iterator[tuple[str, str]]:
         """Lines for people."""
         pushed = self.pushed

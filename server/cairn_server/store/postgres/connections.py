@@ -30,6 +30,8 @@ WAIT_S = 10.0
 """Time for which a thread waits for a connection while all are lent."""
 CONNECT_S = 5
 """Time in which the database has to accept a connection, unless its URL says another."""
+PRIMARY = "read-write"
+"""libpq's `target_session_attrs` of all connections of a store: of several servers the one that takes commits."""
 PREPARE_AFTER = 2
 """Runs of a statement on one connection after which it is prepared: a push is longer parsed and planned than run."""
 SETTINGS = (
@@ -48,13 +50,30 @@ NOTING = "SET synchronous_commit TO off"
 
 
 def connect(url: str, settings: str = "") -> Connection:
-    """A connection with the settings that the store rests on, and more of them.
+    """A connection to the primary of a URL's servers, with the settings that the store rests on, and more of them.
 
     Raises:
         psycopg.Error: it cannot be had.
     """
-    wait = {} if "connect_timeout" in conninfo.conninfo_to_dict(url) else {"connect_timeout": CONNECT_S}
-    made = psycopg.connect(url, autocommit=True, prepare_threshold=PREPARE_AFTER, application_name="cairn", **wait)  # type: ignore[arg-type]
+    # A standby is behind, and an asker that is ahead of it would be sent each cell again.
+    return connect_to_any(url, settings, target_session_attrs=PRIMARY)
+
+
+def connect_to_any(url: str, settings: str = "", **options: str) -> Connection:
+    """The same to the first server of a URL that answers, be it a standby; `options` are libpq's.
+
+    Raises:
+        psycopg.Error: it cannot be had.
+    """
+    stated = conninfo.conninfo_to_dict(url)
+    wait = {} if "connect_timeout" in stated else {"connect_timeout": CONNECT_S}
+    made = psycopg.connect(
+        url,
+        autocommit=True,
+        prepare_threshold=PREPARE_AFTER,
+        application_name="cairn",
+        **(wait | options),  # type: ignore[arg-type]
+    )
     try:
         made.execute(f"{SETTINGS}; {settings}".encode())
     except BaseException:

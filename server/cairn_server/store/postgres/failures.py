@@ -27,6 +27,14 @@ def failure_of(exc: psycopg.Error) -> CairnError:
     return UnreachableError("store_failed", f"the database does not answer: {text}", retry_after_s=RETRY_S)
 
 
+def lost_map(number: int) -> UnreachableError:
+    """Error for a map that a server knows and the database has no more: it was put back to a state before the map.
+
+    The name is looked up again soon (`store.NAMES_S`), and may be another map's by then.
+    """
+    return UnreachableError("store_failed", f"the database has lost map number {number}", retry_after_s=RETRY_S)
+
+
 def opening_failure(exc: psycopg.Error, place: str) -> BadInputError:
     """Error for a database that cannot be opened as a store; `place` names it without its password."""
     text = _cause(exc)

@@ -8,7 +8,8 @@ head, mark, NOTIFY                          one hint for those that wait for new
 
 from collections.abc import Iterator, Sequence
 
-from cairn_map.commits.cursor import ENTRY_FOLD
+from cairn_map.commits.cursor import ENTRY_FOLD, next_chain
+from cairn_map.commits.ids import Author, CommitId
 from cairn_server.store.history import KnownVectors, crosses_mark
 from cairn_server.store.postgres.connections import Connection, Connections, first, rows
 from cairn_server.store.postgres.shares import give_back_sums, lock_head
@@ -58,6 +59,8 @@ def write_fold(connection: Connection, row: MapRow, fold: Fold, *, age_s: float)
     # A part in which no commit was there to be taken out leaves the head where it is.
     query = "SELECT due_from FROM commits WHERE map = %s AND number = %s"
     if any(first(connection, query, (row.number, step.commit)) != step.before for step in fold.steps):
+        return False
+    if not _names_its_commits(connection, row, fold):
         return False
     _write_entries(connection, row, fold, age_s)
     _write_progress(connection, row, fold)
@@ -112,6 +115,25 @@ class PgLeases:
         """End all claims of a holder."""
         with self._connections.lent() as connection:
             connection.execute("DELETE FROM lease WHERE holder = %s", (holder,))
+
+
+def _names_its_commits(connection: Connection, row: MapRow, fold: Fold) -> bool:
+    """True if the numbers of a fold's entries are those of the commits that were planned, as their chain proves.
+
+    A database that was put back to an older state while a fold was planned may have the same head; commits that came
+    since have the numbers of those that were lost.
+    """
+    query = "SELECT number, robot, incarnation, n, sha FROM commits WHERE map = %s AND number = ANY(%s)"
+    found = rows(connection, query, (row.number, [entry.commit for entry in fold.entries]))
+    commits = {number: (CommitId(Author(robot, incarnation), n), sha) for number, robot, incarnation, n, sha in found}
+    chain = fold.base.chain
+    for entry in fold.entries:
+        if entry.commit not in commits:
+            return False
+        chain = next_chain(chain, entry.kind, *commits[entry.commit])
+        if chain != entry.chain:
+            return False
+    return True
 
 
 def _write_entries(connection: Connection, row: MapRow, fold: Fold, age_s: float) -> None:

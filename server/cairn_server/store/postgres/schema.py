@@ -22,7 +22,7 @@ from psycopg.conninfo import conninfo_to_dict
 
 from cairn_map.commits.ids import SERVERS_OWN
 from cairn_map.errors import BadInputError, CairnError
-from cairn_server.store.postgres.connections import Connection, connect, first
+from cairn_server.store.postgres.connections import PRIMARY, Connection, connect, connect_to_any, first
 from cairn_server.store.postgres.failures import opening_failure
 
 SERVER_MIN = 150_000
@@ -310,12 +310,18 @@ def prepare(url: str) -> None:
             store is of a newer cairn.
     """
     try:
-        place = place_of(conninfo_to_dict(url))
+        stated = conninfo_to_dict(url)
+        place = place_of(stated)
     except psycopg.ProgrammingError as exc:  # whose text may quote the password
         raise BadInputError("bad_store", "the URL of the store is none: postgresql://USER@HOST:PORT/DATABASE") from exc
+    wanted = stated.get("target_session_attrs", PRIMARY)
+    if wanted not in (PRIMARY, "primary"):
+        raise BadInputError(
+            "bad_store", f"a store works on the primary alone: leave target_session_attrs={wanted} out of {place}"
+        )
     for turn in range(STARTS_MAX):
         try:
-            with connect(url) as connection, connection.transaction():
+            with _connected(url) as connection, connection.transaction():
                 _check_server(connection, place)
                 _take_steps(connection)
             return
@@ -330,10 +336,23 @@ def prepare(url: str) -> None:
 
 
 def place_of(parts: dict[str, Any]) -> str:
-    """Host, port, database and user of a URL, as people may read them: without the password."""
+    """Hosts, ports, database and user of a URL, as people may read them: without the password."""
     user = f"{parts['user']}@" if parts.get("user") else ""
-    port = f":{parts['port']}" if parts.get("port") else ""
-    return f"postgresql://{user}{parts.get('host', 'localhost')}{port}/{parts.get('dbname', '')}"
+    hosts, ports = (str(parts.get(name) or "").split(",") for name in ("host", "port"))
+    ports = ports * len(hosts) if len(ports) == 1 else ports
+    places = (f"{host or 'localhost'}{port and ':'}{port}" for host, port in zip(hosts, ports, strict=False))
+    return f"postgresql://{user}{','.join(places)}/{parts.get('dbname', '')}"
+
+
+def _connected(url: str) -> Connection:
+    """A connection to the primary; to another server, which is refused for what it is, if none of them is a primary."""
+    try:
+        return connect(url)
+    except psycopg.OperationalError as exc:
+        try:
+            return connect_to_any(url, target_session_attrs="any")
+        except psycopg.OperationalError:
+            raise exc from None
 
 
 def _check_server(connection: Connection, place: str) -> None:

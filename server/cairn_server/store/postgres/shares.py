@@ -15,6 +15,7 @@ from cairn_map.commits.ids import SERVERS_OWN, CommitId
 from cairn_map.errors import BadInputError, ConflictError, NotFoundError
 from cairn_server.store.numbering import Numbering, check_number
 from cairn_server.store.postgres.connections import Connection, Connections, first, rows
+from cairn_server.store.postgres.failures import lost_map
 from cairn_server.store.postgres.schema import IS_RESERVE
 from cairn_server.store.shares import (
     ALARM_PART,
@@ -163,7 +164,8 @@ def close_robot(connection: Connection, row: MapRow, robot: str) -> ClosedRobot:
 
 def lock_head(connection: Connection, row: MapRow) -> None:
     """Lock a map's head: folds and all that may not overlap with them come one after the other."""
-    connection.execute("SELECT 1 FROM head WHERE map = %s FOR NO KEY UPDATE", (row.number,))
+    if not connection.execute("SELECT 1 FROM head WHERE map = %s FOR NO KEY UPDATE", (row.number,)).rowcount:
+        raise lost_map(row.number)
 
 
 class PgShares:

@@ -15,6 +15,7 @@ from cairn_map.evidence.grid import CellKey
 from cairn_map.wire.messages import LogEntry
 from cairn_server.store.history import KnownVectors
 from cairn_server.store.postgres.connections import Connection, first, rows
+from cairn_server.store.postgres.failures import lost_map
 from cairn_server.store.postgres.schema import IS_MEASURED
 from cairn_server.store.postgres.tile_rows import (
     CELL_COLUMNS,
@@ -51,7 +52,10 @@ class PgSnapshot:
         self._map = map_number
         self._geometry_digest = geometry_digest
         self._vectors = vectors
-        self._head = Cursor(*first(connection, "SELECT log_id, seq, chain FROM head WHERE map = %s", (map_number,)))
+        head = first(connection, "SELECT log_id, seq, chain FROM head WHERE map = %s", (map_number,))
+        if head is None:
+            raise lost_map(map_number)
+        self._head = Cursor(*head)
 
     @property
     def head(self) -> Cursor:

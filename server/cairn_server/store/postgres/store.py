@@ -2,6 +2,7 @@
 
 import logging
 import secrets
+import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import suppress
@@ -44,8 +45,12 @@ RETURNING age_s, wall_s
 """
 """The age of the store goes on by the time since any server ticked last, by the database's clock: so all servers have
 one age. Time in which none ran does not count, nor does a jump of that clock: each ticks every 60 s."""
+NUMBER_BITS = 52
+"""Bits of a map's number: exact in any program that reads numbers as floats."""
 CONNECTIONS = 48
 """Most connections of one server to the database, which allows 100 by default."""
+NAMES_S = 1.0
+"""Time for which a map's name is not looked up again: in a database that was put back it may be another map's."""
 NOTING_CONNECTIONS = 12
 """Most besides for what need not be durable at once."""
 
@@ -74,21 +79,23 @@ class PgStore(PgReads):
         self.leases = PgLeases(self._connections)
         self.notes = PgBranches(self._connections, self._threads)
         self.replicas = PgReplicaNotes(self._connections, self._noting, self.notes)
-        self._names: dict[str, MapRow] = {}  # of maps, which never change
+        self._names: dict[str, tuple[MapRow, float]] = {}  # with the time until which a map is known by its name
 
     def create_map(self, name: str, geometry: Geometry, sensor_model: SensorModel) -> tuple[MapRow, bool]:
         """The map and whether it is new; an equal one may exist already."""
         log_id = secrets.token_bytes(16)
-        values = (name, geometry.model_dump_json(), sensor_model.model_dump_json(), secrets.token_bytes(32))
+        # Random, not the next one: servers remember maps that a database put back to an older state has lost, and none
+        # made since may have the number of one of these.
+        number = 1 + secrets.randbits(NUMBER_BITS)
+        values = (number, name, geometry.model_dump_json(), sensor_model.model_dump_json(), secrets.token_bytes(32))
 
         def job(connection: Connection) -> bool:
-            number = first(
-                connection,
-                "INSERT INTO map (name, geometry, sensor_model, seal_key) VALUES (%s, %s, %s, %s)"
-                " ON CONFLICT (name) DO NOTHING RETURNING map",
+            made = connection.execute(
+                "INSERT INTO map (map, name, geometry, sensor_model, seal_key) OVERRIDING SYSTEM VALUE"
+                " VALUES (%s, %s, %s, %s, %s) ON CONFLICT (name) DO NOTHING",
                 values,
             )
-            if number is None:
+            if not made.rowcount:
                 return False
             connection.execute(
                 "INSERT INTO head (map, log_id, seq, chain, fingerprint) VALUES (%s, %s, 0, %s, %s)",
@@ -103,12 +110,13 @@ class PgStore(PgReads):
 
     def map(self, name: str) -> MapRow:
         """The map of a name."""
-        kept = self._names.get(name)
-        if kept is not None:
-            return kept
+        row, until_s = self._names.get(name, (None, 0.0))
+        now_s = time.monotonic()
+        if row is not None and now_s < until_s:
+            return row
         found = self.map_rows("WHERE name = %s", (name,))
         if found:
-            self._names[name] = found[0]
+            self._names[name] = found[0], now_s + NAMES_S
             return found[0]
         raise NotFoundError("no_map", f"there is no map {name!r}; `cairn map ls` lists them")
 
