@@ -22,6 +22,7 @@ from cairn_server.folding.fold_memory import FoldMemory
 from cairn_server.folding.fold_process import FoldProcess
 from cairn_server.folding.fold_thread import FoldThread
 from cairn_server.folding.readiness import FoldHealth, Readiness
+from cairn_server.live.fold_news import FoldNews
 from cairn_server.live.hub import Hub
 from cairn_server.live.replica_watch import ReplicaWatch
 from cairn_server.live.robot_reports import RobotReports
@@ -38,6 +39,7 @@ from cairn_server.metrics import (
 from cairn_server.settings import Settings
 from cairn_server.store.row_spool import remove_spools
 from cairn_server.store.store import Store
+from cairn_server.store.store_rows import MapRow
 from cairn_server.sync.admissions import Admissions
 from cairn_server.sync.handing_over import UpstreamProgress
 from cairn_server.sync.held_commits import HeldCommits, WantedCommits
@@ -90,7 +92,10 @@ class Service:
         self.acts = ActLimit(settings.quotas.acts_per_hour, shared=shared_uses)
         self.live = Hub(store, connections=settings.limit_concurrency)
         self.reports = RobotReports(store, self.live)
-        self.watch = ReplicaWatch(store, self.live, self.reports) if store.replicas is not None else None
+        self.fold_news = FoldNews()
+        self.watch: ReplicaWatch | None = None
+        if store.replicas is not None:
+            self.watch = ReplicaWatch(store, store.replicas, self.live, self.reports, self.fold_news)
         self.maps = Maps(store, self.live, self.reports, settings.memory)
         self.maps.warn_of_large_cells()
 
@@ -105,7 +110,7 @@ class Service:
                 folds,
                 damaged,
                 keep_evidence_s=settings.keep_evidence_s,
-                on_fold=self.live.folded,
+                on_fold=self._folded,
                 may_forget_s=upstream.may_forget_s,
                 process=fold_process,
                 memory=FoldMemory.of_server(settings.memory, settings.folder),
@@ -148,6 +153,11 @@ class Service:
             HeldCommits(store, wanted),
             upstream,
         )
+
+    def _folded(self, row: MapRow) -> None:
+        """Tell of a fold by this server."""
+        self.fold_news.note(row.number)
+        self.live.folded(row)
 
     def _wake_folding(self) -> None:
         if self._fold_thread is not None:

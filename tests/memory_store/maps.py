@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from tests.memory_store.map import MemoryMap
 
 from cairn_map.errors import NotFoundError, UnreachableError
+from cairn_server.store.replica_notes import FoldHint, OnHint
 from cairn_server.store.store_rows import MapRow
 
 
@@ -25,6 +26,7 @@ class MemoryMaps:
         self._is_closed = False
         self.written = 0
         """Changes since the start."""
+        self._on_hint: list[OnHint] = []
 
     @contextmanager
     def locked(self) -> Iterator[dict[str, MemoryMap]]:
@@ -68,6 +70,19 @@ class MemoryMaps:
         with self.reading(row) as state:
             state.is_shared = True
             return state
+
+    def hear_folds(self, on_hint: OnHint) -> None:
+        """Call this after each fold."""
+        self._on_hint.append(on_hint)
+
+    def hear_no_folds(self, on_hint: OnHint) -> None:
+        """Call it no more."""
+        self._on_hint.remove(on_hint)
+
+    def tell_fold(self, hint: FoldHint) -> None:
+        """Tell all who hear folds of one."""
+        for on_hint in list(self._on_hint):
+            on_hint(hint)
 
     def close(self) -> None:
         """Answer nothing any more."""

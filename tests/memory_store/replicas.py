@@ -13,6 +13,7 @@ from cairn_server.store.replica_notes import (
     BodyPart,
     BodyPlace,
     NotedReport,
+    OnHint,
     ReplicaNotes,
     RobotView,
     StagedBody,
@@ -36,6 +37,11 @@ class MemoryReplicaNotes:
         self.uses = MemoryUseAccounts(clocks)
         self.secret = secrets.token_bytes(32)
         self._handed_over: dict[tuple[str, str], float] = {}
+        self._maps = maps
+
+    def fold_hints(self, on_hint: OnHint) -> "MemoryFoldHints":
+        """Begin to hear of folds."""
+        return MemoryFoldHints(self._maps, on_hint)
 
     def put_handed_over(self, upstream: str, map_name: str, age_s: float) -> None:
         """Note up to which age all of a map is on an upstream server."""
@@ -45,6 +51,22 @@ class MemoryReplicaNotes:
     def handed_over(self, upstream: str) -> Mapping[str, float]:
         """Ages by the map's name."""
         return {name: age_s for (url, name), age_s in list(self._handed_over.items()) if url == upstream}
+
+
+class MemoryFoldHints:
+    """`replica_notes.FoldHints`, called by the thread that folds."""
+
+    def __init__(self, maps: MemoryMaps, on_hint: OnHint) -> None:
+        self._maps = maps
+        self._on_hint = on_hint
+        self.are_heard = True
+        maps.hear_folds(on_hint)
+        on_hint(None)
+
+    def close(self) -> None:
+        """Hear no more."""
+        self.are_heard = False
+        self._maps.hear_no_folds(self._on_hint)
 
 
 class MemoryReports:

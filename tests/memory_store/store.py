@@ -23,7 +23,7 @@ from cairn_map.errors import CairnError, NotFoundError, UnreachableError
 from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.store.admission import OWN_WORD, Grounds
-from cairn_server.store.replica_notes import ReplicaNotes
+from cairn_server.store.replica_notes import FoldHint, ReplicaNotes
 from cairn_server.store.store import Store, check_same_map
 from cairn_server.store.store_age import CLOCKS, AgeMark, Clocks, StoreAge
 from cairn_server.store.store_rows import Branch, Fold, MapRow, NewCommit, StoredCommit
@@ -73,11 +73,11 @@ class MemoryStore:
         with self._maps.locked() as maps:
             return [maps[name].row for name in sorted(maps)]
 
-    def heads(self, maps: Collection[MapRow] | None = None) -> list[tuple[MapRow, Cursor]]:
-        """All maps, or those of these that there are, with their present states."""
+    def heads(self, numbers: Collection[int] | None = None) -> list[tuple[MapRow, Cursor]]:
+        """All maps, or those of these numbers that there are, with their present states."""
         with self._maps.locked() as kept:
-            asked = sorted(kept) if maps is None else sorted({row.name for row in maps} & kept.keys())
-            return [(kept[name].row, kept[name].head) for name in asked]
+            found = [(kept[name].row, kept[name].head) for name in sorted(kept)]
+        return [(row, head) for row, head in found if numbers is None or row.number in numbers]
 
     def waiting_maps(self) -> list[MapRow]:
         """Maps with commits to be folded, or with a retract under way, by name."""
@@ -156,7 +156,10 @@ class MemoryStore:
     def fold(self, row: MapRow, fold: Fold) -> bool:
         """Write a fold if the head is still its base; False (and nothing written) otherwise."""
         with self._maps.changing(row) as changed:
-            return changed.fold(fold, age_s=self.age.now_s())
+            is_written = changed.fold(fold, age_s=self.age.now_s())
+        if is_written:
+            self._maps.tell_fold(FoldHint(row.number, fold.head.seq))
+        return is_written
 
     @contextmanager
     def snapshot(self, row: MapRow) -> Iterator[MemorySnapshot]:

@@ -78,6 +78,11 @@ class Hub:
         with self._lock:
             return [live.row for live in self._maps.values() if live.listeners]
 
+    def lacks(self, number: int, seq: int) -> bool:
+        """True if the map of this number has listeners that cannot have heard of a log entry yet."""
+        live = self._maps.get(number)
+        return live is not None and bool(live.listeners) and live.changes.seq < seq
+
     def robots(self, row: MapRow) -> LiveRobots:
         """Robots of a map, with the last sign of each that this server knows of."""
         return self._live(row).robots

@@ -63,6 +63,12 @@ class LiveChanges:
         return self.place()[0]
 
     @property
+    def seq(self) -> int:
+        """Log entry of the newest state that was read; -1: none was."""
+        head = self._head
+        return head.seq if head else -1
+
+    @property
     def losses(self) -> int:
         """Count of the times that the log lost entries which were read: the store was restored."""
         return self.place()[1]

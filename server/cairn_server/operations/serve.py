@@ -117,7 +117,7 @@ def main(argv: list[str]) -> int:
     with _folder_of(settings), listen(settings.host, settings.port) as listener:
         try:
             service = Service(open_store(), settings, fold_process=folding)
-            with closing(service), closing(ViewPrefetch(service.store, service.views.cells.cache)), joined(service):
+            with closing(service), _views_of(service), joined(service):
                 _serve(service, listener, long_bodies)
         except KeyboardInterrupt:
             pass
@@ -140,6 +140,13 @@ def _folder_of(settings: Settings) -> AbstractContextManager[object]:
         return lock_folder(settings.folder)
     except OSError as exc:
         raise BadInputError("bad_store", f"cannot keep files in {settings.folder}: {exc.strerror}") from exc
+
+
+def _views_of(service: Service) -> AbstractContextManager[object]:
+    """Views made ahead, by a server that shows any."""
+    if service.settings.folding == "only":
+        return nullcontext()
+    return closing(ViewPrefetch(service.store, service.views.cells.cache, service.fold_news))
 
 
 def _serve(service: Service, listener: socket.socket, long_bodies: LongBodies) -> None:

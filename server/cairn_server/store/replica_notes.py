@@ -9,10 +9,12 @@ and the use of quotas apart.
     tickets   exports that were asked for and not fetched yet
     bodies    beginnings of commits that come in parts
     uses      use of the quotas, and token buckets
+
+Hints of folds are no notes: a server that folds says so to all, and one that misses it sees the new head when it looks.
 """
 
 import hashlib
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
@@ -212,6 +214,32 @@ class UseAccounts(Protocol):
         ...
 
 
+class FoldHint(NamedTuple):
+    """Hint that a server folded."""
+
+    map: int
+    """Number of the map."""
+    seq: int
+    """Newest log entry."""
+
+
+OnHint = Callable[[FoldHint | None], None]
+"""Receiver of hints, called from one thread; None: some may have been missed until now."""
+
+
+class FoldHints(Protocol):
+    """Hints of folds by all servers of a store, until closed."""
+
+    @property
+    def are_heard(self) -> bool:
+        """True while hints come; False while only looks at the heads tell of folds."""
+        ...
+
+    def close(self) -> None:
+        """Hear no more."""
+        ...
+
+
 class ReplicaNotes(Protocol):
     """Notes of servers over one store; every method may be called from any thread."""
 
@@ -238,6 +266,10 @@ class ReplicaNotes(Protocol):
     @property
     def secret(self) -> bytes:
         """32 random bytes, made with the store: key of the challenges that its servers give."""
+        ...
+
+    def fold_hints(self, on_hint: OnHint) -> FoldHints:
+        """Begin to hear of folds by any server of the store, this one included; hints may be lost at any time."""
         ...
 
     def put_handed_over(self, upstream: str, map_name: str, age_s: float) -> None:

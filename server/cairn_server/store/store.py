@@ -411,8 +411,8 @@ class Store(Protocol):
         """All maps, by name."""
         ...
 
-    def heads(self, maps: Collection[MapRow] | None = None) -> list[tuple[MapRow, Cursor]]:
-        """All maps, or those of these that there are, with their present states, by name; in one query."""
+    def heads(self, numbers: Collection[int] | None = None) -> list[tuple[MapRow, Cursor]]:
+        """All maps, or those of these numbers that there are, with their present states, by name; in one query."""
         ...
 
     def waiting_maps(self) -> list[MapRow]:

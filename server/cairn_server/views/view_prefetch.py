@@ -15,6 +15,7 @@ import time
 from cairn_map.commits.cursor import Cursor
 from cairn_map.errors import CairnError, DamagedDataError
 from cairn_map.evidence.grid import CellKey, cell_key, cell_of_key
+from cairn_server.live.fold_news import FoldNews
 from cairn_server.store.history import is_proven
 from cairn_server.store.store import Store
 from cairn_server.store.store_rows import MapRow
@@ -32,9 +33,11 @@ AT_ONCE = 100
 class ViewPrefetch:
     """Thread that makes and keeps views of a store's maps until closed."""
 
-    def __init__(self, store: Store, views: ViewCache, *, look_every_s: float = LOOK_EVERY_S) -> None:
+    def __init__(self, store: Store, views: ViewCache, news: FoldNews, *, look_every_s: float = LOOK_EVERY_S) -> None:
+        """Begin; `news` has the maps that were folded."""
         self._store = store
         self._views = views
+        self._news = news
         self._look_every_s = look_every_s
         self._seen: dict[int, Cursor] = {}
         """By map: state up to which all cells' views were made."""
@@ -58,22 +61,29 @@ class ViewPrefetch:
             self._closing.wait(self._look_every_s)
 
     def _heads(self) -> list[tuple[MapRow, Cursor]]:
+        """Maps that were folded since the last call, with their present states."""
+        news = self._news.take()
+        if news is not None and not news:
+            return []
         try:
-            return self._store.heads()
+            return self._store.heads(news)
         except CairnError as exc:
             log.info("views cannot be made ahead now: %s", exc.message)
         except Exception:
             log.exception("views cannot be made ahead now")
+        self._news.put_back(news)
         return []
 
     def _make_all(self, row: MapRow) -> None:
         """Make the views of one map; an error leaves the other maps alone."""
         try:
             self._make(row)
+            return
         except CairnError as exc:
             log.info("views of map %s cannot be made ahead now: %s", row.name, exc.message)
         except Exception:
             log.exception("views of map %s cannot be made ahead now", row.name)
+        self._news.note(row.number)
 
     def _make(self, row: MapRow) -> None:
         """Make the views of the cells that changed since the last look."""

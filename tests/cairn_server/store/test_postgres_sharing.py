@@ -2,7 +2,7 @@
 
 import threading
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from functools import partial
 from itertools import pairwise
 
@@ -14,7 +14,7 @@ from tests.fixtures.map.made import SMALL
 from tests.fixtures.server.commit_contract import bodies, folded_map, new_map
 from tests.fixtures.server.crowd_contract import all_at_once
 from tests.fixtures.server.live import until
-from tests.fixtures.server.postgres import Database
+from tests.fixtures.server.postgres import Database, PostgresServer, new_database
 from tests.fixtures.server.pushes import KEYS, MOLE, WREN, pushed, read, sum_of
 from tests.fixtures.server.shares_contract import COUNT_SHARE, PLANES, author_of, heavy, refusal
 from tests.fixtures.server.store_contract import NAMES, new_of
@@ -23,15 +23,17 @@ from cairn_map.commits.commit import Commit
 from cairn_map.commits.cursor import next_chain
 from cairn_map.commits.ids import OPERATOR, Author
 from cairn_map.commits.version_vector import EMPTY
-from cairn_map.errors import ConflictError, NotFoundError
+from cairn_map.errors import ConflictError, NotFoundError, UnreachableError
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.folding.cell_cache import CellCache
 from cairn_server.folding.folding import fold_pending
 from cairn_server.store import history
+from cairn_server.store.postgres import replica_notes as postgres_notes
 from cairn_server.store.postgres import tokens as postgres_tokens
+from cairn_server.store.postgres.connections import Connections
 from cairn_server.store.postgres.folds import CHANNEL
 from cairn_server.store.postgres.store import PgStore
-from cairn_server.store.replica_notes import BodyPart, BodyPlace, UseAnswer, UseBounds
+from cairn_server.store.replica_notes import BodyPart, BodyPlace, FoldHint, FoldHints, UseAnswer, UseBounds
 from cairn_server.store.store_rows import MapRow, Use
 
 pytestmark = [pytest.mark.processes, pytest.mark.slow]
@@ -320,3 +322,57 @@ def test_a_process_that_stops_in_a_write_frees_its_locks_and_does_it_again(postg
     finally:
         other.close()
         store.close()
+
+
+# Hints
+
+
+@contextmanager
+def heard_hints(store: PgStore) -> Iterator[tuple[FoldHints, list[FoldHint | None]]]:
+    """Hints of folds, and what came of them."""
+    heard: list[FoldHint | None] = []
+    with closing(store.replicas.fold_hints(heard.append)) as hints:
+        yield hints, heard
+
+
+def test_hints_come_again_after_the_connection_was_cut(store: PgStore, postgres_database: Database) -> None:
+    row = new_map(store)
+    with heard_hints(store) as (hints, heard):
+        until(lambda: hints.are_heard, "hints come")
+        postgres_database.execute(
+            "SELECT count(pg_terminate_backend(pid)) FROM pg_stat_activity"
+            " WHERE application_name = 'cairn' AND datname = current_database()"
+        )
+        until(lambda: heard.count(None) == 2, "what was missed is said to be")
+        until(lambda: is_appended(store, row), "the store has fresh connections")
+        fold_pending(store, row, CellCache(SMALL), limit=9)
+        until(lambda: FoldHint(row.number, 1) in heard, "the fold is hinted")
+
+
+def is_appended(store: PgStore, row: MapRow) -> bool:
+    """True once a commit is there."""
+    with suppress(UnreachableError):
+        store.append(row, new_of(pushed(0, 0)))
+        return True
+    return False
+
+
+def test_where_notices_do_not_come_back_listening_is_tried_seldom_and_said_once(
+    store: PgStore, postgres: PostgresServer, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As through a pooler in transaction mode: the connection that listens is not the one that is notified."""
+    monkeypatch.setattr(postgres_notes, "PROVE_S", 0.01)
+    monkeypatch.setattr(postgres_notes, "FIRST_PAUSE_S", 0.01)
+    pauses: list[float] = []
+    select = postgres_notes.select.select
+    monkeypatch.setattr(
+        postgres_notes.select, "select", lambda *a: select(*a[:3], min(pauses.append(a[3]) or a[3], 0.01))
+    )
+    heard: list[FoldHint | None] = []
+    elsewhere = Connections(new_database(postgres).url, limit=1)
+    with caplog.at_level("INFO"), closing(postgres_notes.PgFoldHints(store.replicas._url, elsewhere, heard.append)):
+        until(lambda: len(pauses) >= 17, "it was tried often")
+    elsewhere.close()
+    assert heard == [] and pauses[:4] == [0.02, 0.04, 0.08, 0.16]
+    assert pauses[-1] == postgres_notes.SILENT_PAUSE_S
+    assert sum("pooler" in record.getMessage() for record in caplog.records) == 1

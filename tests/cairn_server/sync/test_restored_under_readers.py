@@ -179,7 +179,7 @@ def test_views_are_made_ahead_of_cells_that_changed_under_numbers_of_lost_entrie
     push(own, row, BEFORE[0])
     put_back = saved(own)
     push(own, row, X)
-    with closing(ViewPrefetch(own.service.store, views, look_every_s=3600)) as ahead:
+    with closing(ViewPrefetch(own.service.store, views, own.service.fold_news, look_every_s=3600)) as ahead:
         until(lambda: row.number in ahead._seen, "views are made")
         put_back()
         push(own, row, Y)

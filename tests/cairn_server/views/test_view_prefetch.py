@@ -11,8 +11,10 @@ from tests.fixtures.server.live import Live, until
 from tests.fixtures.server.pushes import KEYS, pushed
 
 from cairn_map.codec.view_code import decode_view
+from cairn_map.errors import UnreachableError
 from cairn_map.evidence.grid import cell_of_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
+from cairn_server.live.fold_news import FoldNews
 from cairn_server.store.store_rows import MapRow
 from cairn_server.views import cell_views
 from cairn_server.views.cell_views import ViewCache, first_depth, view_name, view_of_stored
@@ -32,7 +34,7 @@ def coarse_views(live: Live, row: MapRow) -> dict[str, bytes]:
 def test_what_a_page_asks_for_first_is_there_before_it_asks(live: Live) -> None:
     row = live.new_map()
     views = live.service.views.cells.cache
-    with closing(ViewPrefetch(live.service.store, views, look_every_s=SOON_S)):
+    with closing(ViewPrefetch(live.service.store, views, live.service.fold_news, look_every_s=SOON_S)):
         for number in range(2):
             live.push(row, pushed(number, 0))
             live.folded(row)
@@ -44,6 +46,38 @@ def test_what_a_page_asks_for_first_is_there_before_it_asks(live: Live) -> None:
                 assert answer.content in wanted.values()
                 assert decode_view(answer.content).view.depth == first_depth(3)
             assert views.made == made
+
+
+def test_a_map_in_which_nothing_happens_is_not_looked_at(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
+    idle, busy, store, asked = live.new_map(), live.new_map(), live.service.store, []
+    heads = store.heads
+    monkeypatch.setattr(store, "heads", lambda numbers: asked.append(numbers) or heads(numbers))
+    views, news = ViewCache(), FoldNews()
+    with closing(ViewPrefetch(store, views, news, look_every_s=SOON_S)):
+        until(lambda: asked == [None], "all maps are looked at once")
+        live.push(busy, pushed(0, 0))
+        live.folded(busy)
+        news.note(busy.number)
+        until(lambda: all(views.has(name) for name in coarse_views(live, busy)), "views are made")
+    assert asked == [None, {busy.number}] and idle.number not in asked[1]
+
+
+def test_a_look_that_failed_is_made_again(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
+    row, store, fails = live.new_map(), live.service.store, [True, True]
+    live.push(row, pushed(0, 0))
+    live.folded(row)
+    heads = store.heads
+
+    def failing(numbers: frozenset[int] | None) -> object:
+        if fails:
+            fails.pop()
+            raise UnreachableError("store_failed", "for a moment")
+        return heads(numbers)
+
+    monkeypatch.setattr(store, "heads", failing)
+    views = ViewCache()
+    with closing(ViewPrefetch(store, views, FoldNews(), look_every_s=SOON_S)):
+        until(lambda: all(views.has(name) for name in coarse_views(live, row)), "views are made")
 
 
 def test_a_view_is_not_that_of_another_map_which_had_the_name_before(live: Live) -> None:
@@ -75,7 +109,7 @@ def test_a_map_that_cannot_be_read_leaves_the_others_theirs(live: Live, monkeypa
     live.folded(sound)
     store, views = live.service.store, live.service.views.cells.cache
     monkeypatch.setattr(store, "maps", lambda: [replace(broken, number=-1), sound])
-    with closing(ViewPrefetch(store, views, look_every_s=SOON_S)):
+    with closing(ViewPrefetch(store, views, FoldNews(), look_every_s=SOON_S)):
         until(lambda: all(views.has(name) for name in coarse_views(live, sound)), "views of the sound map are made")
 
 

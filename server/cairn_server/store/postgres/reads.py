@@ -30,15 +30,14 @@ class PgReads:
         """All maps, by name."""
         return self.map_rows("ORDER BY name", ())
 
-    def heads(self, maps: Collection[MapRow] | None = None) -> list[tuple[MapRow, Cursor]]:
-        """All maps, or those of these that there are, with their present states."""
+    def heads(self, numbers: Collection[int] | None = None) -> list[tuple[MapRow, Cursor]]:
+        """All maps, or those of these numbers that there are, with their present states."""
         query = "SELECT map, seal_key, log_id, seq, chain FROM map JOIN head USING (map)"
         with self._connections.lent() as connection:
-            if maps is None:
+            if numbers is None:
                 found = rows(connection, f"{query} ORDER BY name")
             else:
-                numbers = [row.number for row in maps]
-                found = rows(connection, f"{query} WHERE map = ANY(%s) ORDER BY name", (numbers,))
+                found = rows(connection, f"{query} WHERE map = ANY(%s) ORDER BY name", (list(numbers),))
             return [
                 (self._map_row(connection, number, seal_key), Cursor(*cursor)) for number, seal_key, *cursor in found
             ]

@@ -1,47 +1,76 @@
-"""Notes that servers over one database share (`replica_notes.ReplicaNotes`), use of quotas apart.
+"""Notes that servers over one database share, and hints of folds (`replica_notes.ReplicaNotes`); no use of quotas.
 
 Pictures, tickets and parts of bodies lie in tables that are not logged: they cost the database no flush, and a crash of
 it empties them.
 """
 
+import logging
 import secrets
+import select
+import selectors
+import socket
+import threading
+import time
 from collections.abc import Collection, Mapping
+from contextlib import closing
 from typing import Any
 
+import psycopg
+
 from cairn_map.commits.ids import commit_id_from_text
+from cairn_map.errors import CairnError
 from cairn_server.store.postgres.branches import PgBranches
-from cairn_server.store.postgres.connections import Connection, Connections, first, rows
+from cairn_server.store.postgres.connections import Connection, Connections, connect, first, rows
+from cairn_server.store.postgres.folds import CHANNEL
 from cairn_server.store.postgres.use_accounts import PgUseAccounts
 from cairn_server.store.replica_notes import (
     BodyPart,
     BodyPlace,
+    FoldHint,
     NotedReport,
+    OnHint,
     RobotView,
     StagedBody,
     TicketNote,
 )
 from cairn_server.store.store_rows import MapRow
 
+log = logging.getLogger(__name__)
+
 SECRET_BYTES = 32
+FIRST_PAUSE_S, AWAY_PAUSE_S, SILENT_PAUSE_S = 0.5, 10.0, 600.0
+"""Pauses before listening is tried again: the first one, and the longest of those that double, while the database is
+away and where it says nothing."""
+PROVE_S = 5.0
+"""Time in which what this server notifies has to come back to it."""
+PROVE_EVERY_S = 60.0
+"""Time between two such proofs that the connection is alive."""
 
 
 class PgReplicaNotes:
     """All notes of one store."""
 
-    def __init__(self, connections: Connections, noting: Connections, branches: PgBranches) -> None:
+    def __init__(self, url: str, connections: Connections, noting: Connections, branches: PgBranches) -> None:
         """Read the secret of the store, or make it.
 
         Args:
+            url: of the database.
             connections: for what is durable on return.
             noting: for what need not be.
             branches: of the store, among whose notes the statuses are.
         """
+        self._url = url
         self._connections = connections
+        self._noting = noting
         self.reports = PgReports(noting, branches)
         self.tickets = PgTickets(noting)
         self.bodies = PgBodies(noting)
         self.uses = PgUseAccounts(noting)
         self.secret: bytes = connections.run(_secret)
+
+    def fold_hints(self, on_hint: OnHint) -> "PgFoldHints":
+        """Begin to hear of folds by any server of the store."""
+        return PgFoldHints(self._url, self._noting, on_hint)
 
     def put_handed_over(self, upstream: str, map_name: str, age_s: float) -> None:
         """Note up to which age all of a map is on an upstream server. Durable on return."""
@@ -172,6 +201,93 @@ class PgBodies:
     def drop(self, place: BodyPlace) -> None:
         """Drop what is at a place."""
         self._noting.run(lambda connection: _drop(connection, place))
+
+
+class PgFoldHints:
+    """Thread with a connection that listens (`replica_notes.FoldHints`), and connects again by itself.
+
+    A pooler in transaction mode lets LISTEN pass and loses what is notified, and databases that only speak
+    PostgreSQL's language may not know it. So a second connection notifies first, and hints count as heard when that
+    came; else this is tried again after a growing pause, and until then looks at the heads have to do.
+    """
+
+    def __init__(self, url: str, notifying: Connections, on_hint: OnHint) -> None:
+        """Begin; `notifying` are other connections to the same database."""
+        self._url = url
+        self._notifying = notifying
+        self._on_hint = on_hint
+        self.are_heard = False
+        self._closing, self._close = socket.socketpair()
+        self._is_closing = False
+        self._thread = threading.Thread(target=self._run, name="cairn-hints", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Hear no more."""
+        self._is_closing = True
+        self._close.close()
+        self._thread.join()
+        self._closing.close()
+
+    def _run(self) -> None:
+        pause_s = FIRST_PAUSE_S
+        while not self._is_closing:
+            longest_s, said = self._listen()
+            if said and (pause_s == FIRST_PAUSE_S or longest_s == FIRST_PAUSE_S):
+                log.info("no hints of folds by other servers, looking at heads each second: %s", said)
+            pause_s = min(2 * pause_s, longest_s)
+            select.select([self._closing], [], [], pause_s)
+
+    def _listen(self) -> tuple[float, str]:
+        """Pass on hints until that ends; the longest pause before the next try, and the reason."""
+        try:
+            with closing(connect(self._url)) as connection:
+                connection.execute(f"LISTEN {CHANNEL}".encode())
+                said = self._hear(connection)
+                return FIRST_PAUSE_S if self.are_heard else SILENT_PAUSE_S, said
+        except (psycopg.Error, CairnError) as exc:
+            is_away = isinstance(exc, psycopg.OperationalError | CairnError)
+            longest_s = FIRST_PAUSE_S if self.are_heard else AWAY_PAUSE_S if is_away else SILENT_PAUSE_S
+            return longest_s, " ".join(str(exc).split())
+        finally:
+            self.are_heard = False
+
+    def _hear(self, connection: Connection) -> str:
+        """Pass on hints while what is notified comes back; the reason why it ended."""
+        with selectors.DefaultSelector() as events:
+            events.register(self._closing, selectors.EVENT_READ)
+            events.register(connection.fileno(), selectors.EVENT_READ)
+            end_s = 0.0
+            sign = ""
+            while not self._is_closing:
+                if time.monotonic() >= end_s:
+                    if sign:
+                        return "what is notified does not come back, as behind a pooler in transaction mode"
+                    # Said again and again: a link that broke without a word would be silent for ever.
+                    sign, end_s = secrets.token_hex(8), time.monotonic() + PROVE_S
+                    self._notify(sign)
+                events.select(max(0.0, end_s - time.monotonic()))
+                for notice in connection.notifies(timeout=0):
+                    if notice.payload == sign:
+                        sign, end_s = "", time.monotonic() + PROVE_EVERY_S
+                        self._begin()
+                    else:
+                        self._pass_on(notice.payload)
+        return ""
+
+    def _begin(self) -> None:
+        if not self.are_heard:
+            self.are_heard = True
+            self._on_hint(None)
+
+    def _notify(self, sign: str) -> None:
+        with self._notifying.lent() as connection:
+            connection.execute("SELECT pg_notify(%s, %s)", (CHANNEL, sign))
+
+    def _pass_on(self, payload: str) -> None:
+        number, _, seq = payload.partition(" ")
+        if number.isdecimal() and seq.isdecimal():  # else a sign of another server
+            self._on_hint(FoldHint(int(number), int(seq)))
 
 
 def _append(connection: Connection, place: BodyPlace, part: BodyPart) -> StagedBody | None:

@@ -78,7 +78,7 @@ class PgStore(PgReads):
         self.health = PgHealth(self._connections, self._threads, self.age)
         self.leases = PgLeases(self._connections)
         self.notes = PgBranches(self._connections, self._threads)
-        self.replicas = PgReplicaNotes(self._connections, self._noting, self.notes)
+        self.replicas = PgReplicaNotes(url, self._connections, self._noting, self.notes)
         self._names: dict[str, tuple[MapRow, float]] = {}  # with the time until which a map is known by its name
 
     def create_map(self, name: str, geometry: Geometry, sensor_model: SensorModel) -> tuple[MapRow, bool]:

@@ -31,15 +31,15 @@ class SqliteReads:
         """All maps, by name."""
         return self.map_rows("ORDER BY name", ())
 
-    def heads(self, maps: Collection[MapRow] | None = None) -> list[tuple[MapRow, Cursor]]:
-        """All maps, or those of these that there are, with their present states."""
+    def heads(self, numbers: Collection[int] | None = None) -> list[tuple[MapRow, Cursor]]:
+        """All maps, or those of these numbers that there are, with their present states."""
         query = "SELECT number, seal_key, log_id, seq, chain FROM map"
         with self._readers.reading() as reader:
-            if maps is None:
+            if numbers is None:
                 found = rows(reader, f"{query} ORDER BY name")
             else:
                 among = "WHERE number IN (SELECT value FROM json_each(?))"
-                found = rows(reader, f"{query} {among} ORDER BY name", (json.dumps([row.number for row in maps]),))
+                found = rows(reader, f"{query} {among} ORDER BY name", (json.dumps(list(numbers)),))
             return [(self._map_row(reader, number, seal_key), Cursor(*cursor)) for number, seal_key, *cursor in found]
 
     def waiting_maps(self) -> list[MapRow]:
