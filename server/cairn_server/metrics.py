@@ -6,7 +6,7 @@ looked up when the page is asked for. The page is the text format 0.0.4.
 
 import os
 import threading
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -20,8 +20,7 @@ from prometheus_client.registry import Collector
 from cairn_map.wire.empty_cell_frames import EmptyCellFrames
 from cairn_map.wire.frames import CellFrame, Frame
 from cairn_server.processes import used_bytes
-from cairn_server.store.shares import ALARM_PART, ROBOTS_MAX, used_bounds
-from cairn_server.store.store_rows import Backlog, RobotShares, StoreFigures
+from cairn_server.store.store_rows import Backlog, StoreFigures, UsedPart
 
 MEDIA_TYPE = CONTENT_TYPE_PLAIN_0_0_4
 SERIES_MAX = 2000
@@ -48,6 +47,11 @@ class Bounded(Generic[M]):
                     values = ("other",) * len(values)
                 self._series[values] = self._metric.labels(*values)
             return self._series[values]
+
+    def first_values(self) -> set[str]:
+        """Values of the first label so far."""
+        with self._lock:
+            return {values[0] for values in self._series}
 
 
 class ServerFigures:
@@ -89,6 +93,10 @@ class ServerFigures:
     def _histogram(self, name: str, help_text: str, *labels: str) -> Bounded[Histogram]:
         return Bounded(Histogram(name, help_text, labels, registry=self.registry, buckets=SECONDS))
 
+    def maps_at_work(self) -> set[str]:
+        """Names of the maps to which this server took commits, or of which it folded some, since its start."""
+        return (self.pushes.first_values() | self.folded.first_values()) - {"", "other"}
+
     def counted(self, frames: Iterator[Frame | EmptyCellFrames]) -> Iterator[Frame | EmptyCellFrames]:
         """The same frames, counted by kind."""
         for frame in frames:
@@ -116,8 +124,8 @@ def metrics_text(metrics: Iterable[Metric]) -> str:
     return generate_latest(_Page(metrics)).decode()
 
 
-def store_metrics(found: StoreFigures, backlogs: list[Backlog]) -> Iterator[Metric]:
-    """Sizes, writes and backlogs of the store."""
+def store_metrics(found: StoreFigures, backlogs: list[Backlog], at_work: Collection[str]) -> Iterator[Metric]:
+    """Sizes, writes and backlogs of the store; of maps at work also that nothing waits."""
     yield GaugeMetricFamily("cairn_store_size_bytes", "Size of the store at rest.", found.size_bytes)
     yield GaugeMetricFamily("cairn_wal_size_bytes", "Size of what the store wrote ahead.", found.ahead_bytes)
     if found.free_bytes is not None:
@@ -133,10 +141,10 @@ def store_metrics(found: StoreFigures, backlogs: list[Backlog]) -> Iterator[Metr
     for kind, count in (dict.fromkeys(("disk_full", "store_failed"), 0) | found.failures).items():
         failures.add_metric([kind], count)
     yield failures
-    ages_s = {b.map: b.waited_s or 0.0 for b in backlogs}
-    yield _gauge_by_map(
-        "cairn_pending_commits", "Commits that are durable but not folded.", {b.map: b.commits for b in backlogs}
-    )
+    idle = dict.fromkeys(sorted(at_work), 0.0)
+    waiting = idle | {b.map: float(b.commits) for b in backlogs}
+    ages_s = idle | {b.map: b.waited_s for b in backlogs}
+    yield _gauge_by_map("cairn_pending_commits", "Commits that are durable but not folded.", waiting)
     yield _gauge_by_map("cairn_pending_oldest_age_seconds", "Age of the oldest of them; 0 without any.", ages_s)
 
 
@@ -153,25 +161,15 @@ def _gauge_by_map(name: str, help_text: str, values: Mapping[str, float]) -> Gau
     return gauge
 
 
-def share_metrics(shares: Mapping[str, Sequence[RobotShares]]) -> Iterator[Metric]:
+def share_metrics(used: Iterable[UsedPart]) -> Iterator[Metric]:
     """Parts above a half of what robots may use of each map's bounds, fullest first; the reserve has no robot."""
     gauge = GaugeMetricFamily(
         "cairn_share_used_ratio",
         "Used part of a robot's share of a map's bound, from a half on.",
         labels=["map", "robot", "bound"],
     )
-    found = [
-        (part, map_name, share.robot, bound)
-        for map_name, of_map in shares.items()
-        for share in of_map
-        for bound, part in used_bounds(share).items()
-    ]
-    for map_name, of_map in shares.items():
-        robots = sum(1 for share in of_map if share.robot)
-        found.append((robots / ROBOTS_MAX, map_name, "", "robots"))
-    for part, *labels in sorted(found, reverse=True)[:SERIES_MAX]:
-        if part > ALARM_PART:
-            gauge.add_metric(labels, part)
+    for each in sorted(used, key=lambda each: each.part, reverse=True)[:SERIES_MAX]:
+        gauge.add_metric([each.map, each.robot, each.bound], each.part)
     yield gauge
 
 

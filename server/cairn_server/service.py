@@ -10,6 +10,8 @@ Only what is durable and fully validated is acknowledged; folding comes afterwar
 many threads.
 """
 
+import math
+import time
 from dataclasses import dataclass
 from itertools import chain
 
@@ -39,7 +41,7 @@ from cairn_server.metrics import (
 from cairn_server.settings import Settings
 from cairn_server.store.row_spool import remove_spools
 from cairn_server.store.store import Store
-from cairn_server.store.store_rows import MapRow
+from cairn_server.store.store_rows import MapRow, UsedPart
 from cairn_server.sync.admissions import Admissions
 from cairn_server.sync.handing_over import UpstreamProgress
 from cairn_server.sync.held_commits import HeldCommits, WantedCommits
@@ -52,6 +54,8 @@ from cairn_server.views.export_tickets import ExportTickets
 from cairn_server.views.map_exports import MapExports
 from cairn_server.views.map_views import MapViews
 
+KEEP_FULL_AUTHORS_S = 300.0
+"""Time for which the list of filling shares of authors is kept, however often the metrics are asked for."""
 WORK_GRACE_S = 4.0
 """Time after the signal to stop for which requests that compute for long go on."""
 
@@ -87,6 +91,8 @@ class Service:
         self.store = store
         self.settings = settings
         self.figures = ServerFigures()
+        self._full_authors_now: list[UsedPart] = []
+        self._full_authors_until_s = -math.inf
         self.stop_time = StopTime()
         shared_uses = store.replicas.uses if store.replicas is not None else None
         self.acts = ActLimit(settings.quotas.acts_per_hour, shared=shared_uses)
@@ -167,11 +173,19 @@ class Service:
         """True unless what came is to be folded here, and cannot."""
         return self._fold_thread is None or self._fold_thread.is_alive()
 
+    def _full_authors(self) -> list[UsedPart]:
+        """Shares of authors that are filling, as they were some minutes ago: reading them reads all authors."""
+        if time.monotonic() >= self._full_authors_until_s:
+            self._full_authors_now = self.store.shares.full_authors()
+            self._full_authors_until_s = time.monotonic() + KEEP_FULL_AUTHORS_S
+        return self._full_authors_now
+
     def metrics_text(self) -> str:
         """All metrics for Prometheus."""
-        store = store_metrics(self.store.health.figures(), self.store.health.backlogs())
+        health = self.store.health
+        store = store_metrics(health.figures(), health.backlogs(), self.figures.maps_at_work())
         upstream = upstream_metrics(self.sync.upstream.ages_s())
-        shares = share_metrics({row.name: self.store.shares.of(row) for row in self.store.maps()})
+        shares = share_metrics([*self.store.shares.full_sums(), *self._full_authors()])
         memory = memory_metrics(self.settings.memory.limit_bytes)
         return metrics_text(chain(self.figures.registry.collect(), store, shares, upstream, memory, process_metrics()))
 

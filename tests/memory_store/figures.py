@@ -1,6 +1,6 @@
 """What a store in memory tells of itself: its health, what robots' commits took, what is kept of branches."""
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Mapping
 from contextlib import suppress
 
@@ -9,6 +9,7 @@ from tests.memory_store.maps import MemoryMaps
 
 from cairn_map.commits.cursor import ENTRY_FOLD
 from cairn_map.errors import UnreachableError
+from cairn_server.store.shares import full_authors
 from cairn_server.store.store_age import StoreAge
 from cairn_server.store.store_rows import (
     Backlog,
@@ -20,6 +21,7 @@ from cairn_server.store.store_rows import (
     RobotShares,
     StoreFigures,
     Use,
+    UsedPart,
     relay_of,
 )
 
@@ -32,9 +34,11 @@ class MemoryHealth:
         self._age = age
 
     def backlogs(self) -> list[Backlog]:
-        """What is not folded yet, of every map."""
+        """What is not folded yet, of the maps that have any."""
         with self._maps.locked() as maps:
-            return [_backlog(state, self._age.now_s()) for state in maps.values()]
+            found = [(state.row.name, list(state.due())) for state in maps.values()]
+        now_s = self._age.now_s()
+        return [Backlog(name, len(due), now_s - due[0].received_age_s) for name, due in found if due]
 
     def figures(self) -> StoreFigures:
         """Sizes and counts."""
@@ -93,6 +97,25 @@ class MemoryShares:
         with self._maps.reading(row) as state:
             return state.shares()
 
+    def full_sums(self) -> list[UsedPart]:
+        """Shares of the sums of which more than half is used, of all maps."""
+        with self._maps.locked() as maps:
+            return [
+                UsedPart(name, share.robot, "sums", share.sums)
+                for name, state in maps.items()
+                for share in state.shares()
+                if share.sums is not None
+            ]
+
+    def full_authors(self) -> list[UsedPart]:
+        """The same of incarnations, intervals and robots."""
+        with self._maps.locked() as maps:
+            shares = [(name, share) for name, state in maps.items() for share in state.shares()]
+        robots = Counter(name for name, share in shares if share.robot)
+        return full_authors(
+            [(name, share.robot, share.incarnations, share.intervals) for name, share in shares], robots.items()
+        )
+
     def regions(self, row: MapRow, robot: str) -> list[int]:
         """Regions in which a robot has evidence, pending or in the map, rising."""
         with self._maps.reading(row) as state:
@@ -130,11 +153,6 @@ class MemoryNotes:
                 author = commit.id.author if entry.kind == ENTRY_FOLD else None
                 found.append(EntrySize(seq, author, commit.size_bytes))
         return found
-
-
-def _backlog(state: MemoryMap, age_s: float) -> Backlog:
-    waiting = list(state.due())
-    return Backlog(state.row.name, len(waiting), age_s - waiting[0].received_age_s if waiting else None)
 
 
 def _size_bytes(state: MemoryMap) -> int:

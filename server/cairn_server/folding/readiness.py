@@ -120,5 +120,5 @@ class Readiness:
 
     def _lag(self) -> list[str]:
         limit_s, damaged = self._settings.fold_lag_max_s, self._folds.damaged()
-        lag_s = max((b.waited_s or 0.0 for b in self._store.backlogs() if b.map not in damaged), default=0.0)
+        lag_s = max((b.waited_s for b in self._store.backlogs() if b.map not in damaged), default=0.0)
         return [f"fold_lag: a commit has waited for {lag_s:.0f} s (at most {limit_s:.0f})"] if lag_s > limit_s else []

@@ -14,13 +14,15 @@ server refuse another's commit. What is taken out of the map again is given back
 Closing a robot moves what it holds into the reserve; its name begins again with an empty share.
 """
 
+from collections.abc import Iterable, Sequence
 from operator import gt, truediv
+from typing import Any
 
 from cairn_map.commits.ids import SERVERS_OWN
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.evidence import COUNT_MAX, SUM_MAX
 from cairn_map.evidence.grid import CellKey, Geometry, cell_of_key
-from cairn_server.store.store_rows import RobotShares
+from cairn_server.store.store_rows import RobotShares, UsedPart
 
 Tops = tuple[int, ...]
 """(2 + P) largest number of each plane. No array: a commit has few regions, and the thread that writes little time."""
@@ -112,6 +114,28 @@ def used_bounds(share: RobotShares) -> dict[str, float]:
         "incarnations": share.incarnations / authors_max,
         "intervals": share.intervals / intervals_max,
     }
+
+
+LEAST_FULL = INCARNATIONS_MAX * ALARM_PART, INTERVALS_OF_ROBOT_MAX * ALARM_PART
+"""Authors and intervals of an account above which more than half of any account's bound may be used."""
+
+
+def full_authors(accounts: Iterable[Sequence[Any]], crowded: Iterable[Sequence[Any]]) -> list[UsedPart]:
+    """Parts above a half of the bounds of authors and robots.
+
+    Args:
+        accounts: map's name, account, count of its authors and of their intervals; at least those above `LEAST_FULL`.
+        crowded: map's name and count of its robots; at least those above a half.
+    """
+    found = [
+        UsedPart(name, account, bound, part)
+        for name, account, authors, intervals in accounts
+        for bound, part in used_bounds(
+            RobotShares(robot=account, incarnations=authors, intervals=intervals, sums=None)
+        ).items()
+    ]
+    found += [UsedPart(name, RESERVE, "robots", robots / ROBOTS_MAX) for name, robots in crowded]
+    return [used for used in found if used.part > ALARM_PART]
 
 
 def check_reserve(*, authors: int, intervals: int, what: str) -> None:

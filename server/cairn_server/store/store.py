@@ -43,6 +43,7 @@ from cairn_server.store.store_rows import (
     Token,
     Totals,
     Use,
+    UsedPart,
 )
 from cairn_server.store.tiles import Box
 
@@ -198,6 +199,14 @@ class Shares(Protocol):
         """Use of its shares by every robot, and of the reserve, by name."""
         ...
 
+    def full_sums(self) -> list[UsedPart]:
+        """Shares of the sums of which more than half is used, of all maps; an idle map costs nothing."""
+        ...
+
+    def full_authors(self) -> list[UsedPart]:
+        """The same of incarnations, intervals and robots, in few queries that read through all authors."""
+        ...
+
     def regions(self, row: MapRow, robot: str) -> list[int]:
         """Regions (`shares.REGION_BITS`) in which a robot has evidence, pending or in the map, rising."""
         ...
@@ -216,7 +225,7 @@ class StoreHealth(Protocol):
     """State of a store, for administrators and probes."""
 
     def backlogs(self) -> list[Backlog]:
-        """Commits of every map that are not folded yet, or whose retract is under way."""
+        """Commits that are not folded yet, or whose retract is under way, of the maps that have any."""
         ...
 
     def figures(self) -> StoreFigures:

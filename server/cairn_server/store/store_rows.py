@@ -264,6 +264,17 @@ class RobotShares:
     """Part of its share of the sums that is taken in its fullest region; None: not more than half."""
 
 
+@dataclass(frozen=True, slots=True)
+class UsedPart:
+    """Part of a bound of a map that is used, of which more than half is (`shares.ALARM_PART`)."""
+
+    map: str
+    robot: str
+    """Name of the robot whose share it is; empty: the reserve, or with bound `robots` the map."""
+    bound: str
+    part: float
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClosedRobot:
     """Result of closing a robot."""
@@ -279,12 +290,12 @@ def relay_of(token: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Backlog:
-    """Commits of one map that are durable but not folded."""
+    """Commits of one map that are durable but not folded; at least one."""
 
     map: str
     commits: int
-    waited_s: float | None
-    """Seconds for which the oldest one has waited while a server ran; None without any."""
+    waited_s: float
+    """Seconds for which the oldest one has waited while a server ran."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

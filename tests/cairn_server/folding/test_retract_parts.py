@@ -129,7 +129,7 @@ def test_a_retract_under_way_goes_on_after_a_start_and_from_a_backup_of_that_mom
     while fold_pending(store, row, CellCache(SMALL), limit=64):
         pass
     assert [entry.kind for entry in log_of(store, row)] == ["+"] * 6 + ["-"] * 5
-    assert store.health.backlogs()[0].commits == 0
+    assert store.health.backlogs() == []
     store.close()
 
 

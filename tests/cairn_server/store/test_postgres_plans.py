@@ -4,9 +4,11 @@ They are asked for few rows each: for many of them PostgreSQL may rightly read t
 """
 
 import json
+import math
 import re
 from collections.abc import Callable, Iterator
 from contextlib import closing
+from pathlib import Path
 from typing import Any
 
 import psycopg
@@ -19,6 +21,8 @@ from cairn_map.commits.ids import CommitId
 from cairn_map.commits.version_vector import EMPTY
 from cairn_map.evidence.grid import Cell, cell_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
+from cairn_server.service import Service
+from cairn_server.settings import Settings
 from cairn_server.store.postgres import connections, health, reads, retention, snapshot, tile_rows
 from cairn_server.store.postgres.connections import Connection
 from cairn_server.store.postgres.snapshot import PgSnapshot
@@ -130,3 +134,34 @@ def test_no_query_outside_of_snapshots_reads_through_commits(store: PgStore, sca
     store.uses.since(COMMITS - 9.0)
     store.forget_evidence(row, before_s=9000.0, limit=9)
     assert scanned == []
+
+
+def test_idle_maps_cost_probes_and_metrics_no_statement(
+    store: PgStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[object] = []
+    execute = psycopg.Connection.execute
+    service = Service(store, Settings(folder=tmp_path, folding="elsewhere"))
+
+    def counted(self: Connection, query: Any, *args: Any, **options: Any) -> Any:
+        asked.append(query)
+        return execute(self, query, *args, **options)
+
+    def statements() -> int:
+        service._full_authors_until_s = service.readiness._looked_s = -math.inf
+        asked.clear()
+        with monkeypatch.context() as counting:
+            counting.setattr(psycopg.Connection, "execute", counted)
+            service.metrics_text()
+            service.readiness.reasons()
+        return len(asked)
+
+    assert service.watch is not None
+    service.watch.close()  # it asks by itself
+    statements()
+    before = statements()
+    for n in range(50):
+        store.create_map(f"idle{n}", SMALL, SensorModel())
+    assert statements() == before < 20
+    monkeypatch.setattr(store, "close", lambda: None)  # by the fixture
+    service.close()

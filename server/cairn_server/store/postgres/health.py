@@ -49,22 +49,17 @@ class PgHealth:
         self._age = age
 
     def backlogs(self) -> list[Backlog]:
-        """Commits of every map that are not folded yet, or whose retract is under way."""
+        """Commits that are not folded yet, or whose retract is under way, of the maps that have any."""
+        count = f"SELECT map, count(*) FROM commits WHERE {IS_WAITING} GROUP BY map ORDER BY map LIMIT %s"
         query = (
-            "SELECT name, waiting.count, oldest.received_age_s FROM map"
-            " CROSS JOIN LATERAL (SELECT count(*) FROM commits"
-            f"   WHERE commits.map = map.map AND {IS_WAITING}) AS waiting"
-            " LEFT JOIN LATERAL (SELECT received_age_s FROM commits"
-            f"   WHERE commits.map = map.map AND {IS_WAITING} ORDER BY number LIMIT 1) AS oldest ON true"
-            " ORDER BY map.map LIMIT %s"
+            f"SELECT name, waiting.count, oldest.received_age_s FROM ({count}) AS waiting JOIN map USING (map)"
+            " CROSS JOIN LATERAL (SELECT received_age_s FROM commits"
+            f"   WHERE commits.map = waiting.map AND {IS_WAITING} ORDER BY number LIMIT 1) AS oldest"
         )
         with self._connections.lent() as connection:
             found = rows(connection, query, (MAPS_MAX,))
         now_s = self._age.now_s()
-        return [
-            Backlog(name, count, None if oldest_s is None else max(0.0, now_s - oldest_s))
-            for name, count, oldest_s in found
-        ]
+        return [Backlog(name, count, max(0.0, now_s - oldest_s)) for name, count, oldest_s in found]
 
     def figures(self) -> StoreFigures:
         """Sizes and counts."""

@@ -19,15 +19,18 @@ from cairn_server.store.postgres.failures import lost_map
 from cairn_server.store.postgres.schema import IS_RESERVE
 from cairn_server.store.shares import (
     ALARM_PART,
+    LEAST_FULL,
     RESERVE,
+    ROBOTS_MAX,
     Tops,
     account_of,
     check_reserve,
     check_sums,
+    full_authors,
     limits_of,
     used_part,
 )
-from cairn_server.store.store_rows import ClosedRobot, MapRow, RobotShares
+from cairn_server.store.store_rows import ClosedRobot, MapRow, RobotShares, UsedPart
 
 Accounts = Mapping[tuple[str, int], Tops]
 """Totals by account and region."""
@@ -188,6 +191,34 @@ class PgShares:
             RobotShares(robot=account, incarnations=count, intervals=intervals, sums=parts.get(account))
             for account, count, intervals in found
         ]
+
+    def full_sums(self) -> list[UsedPart]:
+        """Shares of the sums of which more than half is used, of all maps, along the index of these."""
+        query = (
+            "SELECT name, account, part FROM"
+            f" (SELECT map, account, max(part) AS part FROM held WHERE part > {ALARM_PART} GROUP BY 1, 2) AS much"
+            " JOIN map USING (map)"
+        )
+        with self._connections.lent() as connection:
+            return [UsedPart(name, account, "sums", part) for name, account, part in rows(connection, query)]
+
+    def full_authors(self) -> list[UsedPart]:
+        """The same of incarnations, intervals and robots."""
+        accounts = f"CASE WHEN {IS_RESERVE} THEN '{RESERVE}' ELSE robot END"
+        authors = (
+            "SELECT name, account, authors, intervals FROM"
+            f" (SELECT map, {accounts} AS account, count(*) AS authors, sum(intervals)::bigint AS intervals FROM author"
+            "   GROUP BY 1, 2 HAVING count(*) > %s OR sum(intervals) > %s) AS much JOIN map USING (map)"
+        )
+        robots = (
+            "SELECT name, robots FROM"
+            f" (SELECT map, count(DISTINCT robot) AS robots FROM author WHERE NOT {IS_RESERVE}"
+            "   GROUP BY 1 HAVING count(DISTINCT robot) > %s) AS much JOIN map USING (map)"
+        )
+        with self._connections.snapshot() as connection:
+            much = rows(connection, authors, LEAST_FULL)
+            crowded = rows(connection, robots, (ROBOTS_MAX * ALARM_PART,))
+        return full_authors(much, crowded)
 
     def regions(self, row: MapRow, robot: str) -> list[int]:
         """Regions in which a robot has evidence, pending or in the map, rising."""

@@ -12,7 +12,7 @@ from cairn_map.evidence.grid import CellKey, Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.store.history import KnownVectors
 from cairn_server.store.sqlite.readers import Readers
-from cairn_server.store.sqlite.schema import WAITING
+from cairn_server.store.sqlite.schema import WAITING, WAITING_MAPS
 from cairn_server.store.sqlite.snapshot import SqliteSnapshot
 from cairn_server.store.sqlite.writer import Values, first, rows
 from cairn_server.store.store_rows import MapRow, StoredCommit
@@ -44,11 +44,7 @@ class SqliteReads:
 
     def waiting_maps(self) -> list[MapRow]:
         """Maps with commits to be folded, or with a retract under way, by name."""
-        waiting = (
-            "SELECT map FROM commits WHERE folded_seq IS NULL AND damaged IS NULL"
-            " UNION SELECT map FROM commits WHERE due_from IS NOT NULL"
-        )
-        return self.map_rows(f"WHERE number IN ({waiting}) ORDER BY name", ())
+        return self.map_rows(f"WHERE number IN ({WAITING_MAPS}) ORDER BY name", ())
 
     def maps_with_evidence(self, *, before_s: float) -> list[MapRow]:
         """Maps with evidence of commits folded before an age of the store, by name."""

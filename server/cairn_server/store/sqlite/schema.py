@@ -14,6 +14,11 @@ WAITING = (
     " UNION ALL SELECT number FROM commits WHERE map = ?1 AND due_from IS NOT NULL)"
 )
 """SQL of the numbers of a map's commits that folding has still to do with, along the indices of both."""
+WAITING_MAPS = (
+    "SELECT map FROM commits WHERE folded_seq IS NULL AND damaged IS NULL"
+    " UNION SELECT map FROM commits WHERE due_from IS NOT NULL"
+)
+"""SQL of the maps that have any."""
 IS_MEASURED = "folded_seq IS NOT NULL AND unfolded_seq IS NULL AND cells > 0 AND captured_last_s <= received_s + 600"
 """SQL of the commits in the map that say credibly when they were captured; seconds of `CAPTURED_AHEAD_MAX_S`."""
 

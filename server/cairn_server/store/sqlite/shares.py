@@ -16,18 +16,21 @@ from cairn_map.errors import BadInputError, ConflictError, NotFoundError
 from cairn_server.store.numbering import Numbering, check_number
 from cairn_server.store.shares import (
     ALARM_PART,
+    LEAST_FULL,
     RESERVE,
+    ROBOTS_MAX,
     Tops,
     account_of,
     check_old_sums,
     check_reserve,
     check_sums,
+    full_authors,
     used_part,
 )
 from cairn_server.store.sqlite.old_sums import old_sums
 from cairn_server.store.sqlite.readers import Readers
 from cairn_server.store.sqlite.writer import Writer, first, rows
-from cairn_server.store.store_rows import ClosedRobot, MapRow, NewCommit, RobotShares
+from cairn_server.store.store_rows import ClosedRobot, MapRow, NewCommit, RobotShares, UsedPart
 
 SERVERS_IN_SQL = ", ".join(f"'{robot}'" for robot in sorted(SERVERS_OWN))
 IS_RESERVE = f"(closed = 1 OR robot IN ({SERVERS_IN_SQL}))"
@@ -140,6 +143,32 @@ class SqliteShares:
             RobotShares(robot=account, incarnations=count, intervals=intervals, sums=parts.get(account))
             for account, count, intervals in found
         ]
+
+    def full_sums(self) -> list[UsedPart]:
+        """Shares of the sums of which more than half is used, of all maps, along the index of these."""
+        query = (
+            "SELECT name, account, max(part) FROM held JOIN map ON map.number = held.map"  # noqa: S608 - our own number
+            f" WHERE part > {ALARM_PART} GROUP BY map.number, account"
+        )
+        with self._readers.reading() as reader:
+            return [UsedPart(name, account, "sums", part) for name, account, part in rows(reader, query)]
+
+    def full_authors(self) -> list[UsedPart]:
+        """The same of incarnations, intervals and robots."""
+        accounts = f"CASE WHEN {IS_RESERVE} THEN '{RESERVE}' ELSE robot END"
+        name = "(SELECT name FROM map WHERE number = author.map)"
+        authors = (
+            f"SELECT {name}, {accounts} AS account, count(*), sum(intervals) FROM author"  # noqa: S608 - our own clauses
+            " GROUP BY map, account HAVING count(*) > ? OR sum(intervals) > ?"
+        )
+        robots = (
+            f"SELECT {name}, count(DISTINCT robot) FROM author WHERE NOT {IS_RESERVE}"  # noqa: S608 - our own clauses
+            " GROUP BY map HAVING count(DISTINCT robot) > ?"
+        )
+        with self._readers.transaction() as reader:
+            much = rows(reader, authors, LEAST_FULL)
+            crowded = rows(reader, robots, (ROBOTS_MAX * ALARM_PART,))
+        return full_authors(much, crowded)
 
     def regions(self, row: MapRow, robot: str) -> list[int]:
         """Regions in which a robot has evidence, pending or in the map, rising."""

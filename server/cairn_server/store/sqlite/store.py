@@ -30,7 +30,7 @@ from cairn_server.store.sqlite.readers import Readers
 from cairn_server.store.sqlite.reads import SqliteReads
 from cairn_server.store.sqlite.retention import forget_evidence
 from cairn_server.store.sqlite.robot_keys import SqliteAdmittedKeys, admit_registration
-from cairn_server.store.sqlite.schema import WAITING, ensure_schema
+from cairn_server.store.sqlite.schema import WAITING, WAITING_MAPS, ensure_schema
 from cairn_server.store.sqlite.shares import SqliteShares
 from cairn_server.store.sqlite.tile_rows import fill_tiles
 from cairn_server.store.sqlite.tokens import (
@@ -315,20 +315,18 @@ class SqliteHealth:
         self._age = age
 
     def backlogs(self) -> list[Backlog]:
-        """Commits of every map that are not folded yet, or whose retract is under way."""
-        # Both go along the indices of what waits: a folded log of any length costs nothing.
+        """Commits that are not folded yet, or whose retract is under way, of the maps that have any."""
+        # All go along the indices of what waits: a folded log of any length costs nothing, nor does an idle map.
         waiting = WAITING.replace("?1", "map.number")
         query = (
             f"SELECT name, (SELECT count(*) FROM {waiting}), (SELECT received_age_s FROM commits"  # noqa: S608 - our own clause
-            f" WHERE number = (SELECT min(number) FROM {waiting})) FROM map ORDER BY map.number LIMIT ?"
+            f" WHERE number = (SELECT min(number) FROM {waiting})) FROM map WHERE number IN ({WAITING_MAPS})"
+            " ORDER BY map.number LIMIT ?"
         )
         with self._readers.reading() as reader:
             found = rows(reader, query, (MAPS_MAX,))
         now_s = self._age.now_s()
-        return [
-            Backlog(name, count, None if oldest_s is None else max(0.0, now_s - oldest_s))
-            for name, count, oldest_s in found
-        ]
+        return [Backlog(name, count, max(0.0, now_s - oldest_s)) for name, count, oldest_s in found]
 
     def figures(self) -> StoreFigures:
         """Sizes and counts."""
