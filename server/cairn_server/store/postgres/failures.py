@@ -30,7 +30,7 @@ def failure_of(exc: psycopg.Error) -> CairnError:
 def lost_map(number: int) -> UnreachableError:
     """Error for a map that a server knows and the database has no more: it was put back to a state before the map.
 
-    The name is looked up again soon (`store.NAMES_S`), and may be another map's by then.
+    The name is looked up again soon (`store.NAMES_S`), and may be another map's now.
     """
     return UnreachableError("store_failed", f"the database has lost map number {number}", retry_after_s=RETRY_S)
 
