@@ -28,6 +28,7 @@ SILENCE_MAX_S = 15.0
 FAULT_EVERY_S = 5.0
 SLEEP_S = 8.0
 """More than `store.LEASE_S`."""
+Fault = tuple[str, Callable[[], None]]
 
 
 @dataclass(slots=True)
@@ -79,22 +80,31 @@ def fault_run(
         site = Site(folder, postgres, "cairn")
         for role in ("server",) * servers + ("folder",) * folders:
             site.add(role)
-        map_url = f"{site.urls()[0]}/maps/lab"
-        body = CreateMap(geometry=SMALL).model_dump_json()
-        httpx.put(map_url, content=body, headers={"Content-Type": "application/json"}).raise_for_status()
-        _push_under_faults(site, found, chance, seconds=seconds, robots=robots)
-        _judge(site, found)
+        faults = list(_faults(site))
+        chance.shuffle(faults)
+        push_under_faults(site, found, faults, chance, seconds=seconds, robots=robots)
         site.close()
     return found
 
 
-def _push_under_faults(site: Site, found: FaultRun, chance: random.Random, *, seconds: float, robots: int) -> None:
+def push_under_faults(
+    site: Site, found: FaultRun, faults: list[Fault], chance: random.Random, *, seconds: float, robots: int
+) -> None:
+    """Push into a new map of a site that suffers faults, one after the other, and look at its store."""
+    map_url = f"{site.urls()[0]}/maps/lab"
+    body = CreateMap(geometry=SMALL).model_dump_json()
+    httpx.put(map_url, content=body, headers={"Content-Type": "application/json"}).raise_for_status()
+    _push(site, found, faults, chance, seconds=seconds, robots=robots)
+    _judge(site, found)
+
+
+def _push(
+    site: Site, found: FaultRun, faults: list[Fault], chance: random.Random, *, seconds: float, robots: int
+) -> None:
     ended, start_s = threading.Event(), time.monotonic()
     found.pushed.last_s = start_s
     pushers = [Pusher(site, found.pushed, number, ended) for number in range(robots)]
     try:
-        faults = list(_faults(site))
-        chance.shuffle(faults)
         for what, act in (faults * 1000)[: max(1, int(seconds / FAULT_EVERY_S))]:
             threading.Event().wait(FAULT_EVERY_S * chance.uniform(0.3, 0.8))
             act()
@@ -109,7 +119,7 @@ def _push_under_faults(site: Site, found: FaultRun, chance: random.Random, *, se
     found.seconds = time.monotonic() - start_s
 
 
-def _faults(site: Site) -> Iterator[tuple[str, Callable[[], None]]]:
+def _faults(site: Site) -> Iterator[Fault]:
     for member in site.members:
         yield f"kill -9 of a {member.role}", kill_and_start(site, member)
         if member.role == "folder":

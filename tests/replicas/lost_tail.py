@@ -22,7 +22,7 @@ from pathlib import Path
 
 import httpx
 from tests.fixtures.client.made import GEOMETRY
-from tests.fixtures.server.live import until
+from tests.fixtures.server.deadline import until
 from tests.replicas.fault_run import SILENCE_MAX_S, postgres_in
 from tests.replicas.mappers import Mapper, Team, mapping, settle
 from tests.replicas.site import Site
@@ -75,8 +75,7 @@ def lost_tail_run(folder: Path, programs: Path, *, seeds: range) -> LostTails:
     with postgres_in(programs) as postgres:
         postgres.execute("CREATE DATABASE cairn")
         site = Site(folder, postgres, "cairn")
-        for role in ("server", "server", "folder"):
-            site.add(role)
+        site.add_all("server", "both")
         for seed in seeds:
             _lose_once(site, folder / f"robots{seed}", seed, found)
         site.close()

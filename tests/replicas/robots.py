@@ -14,6 +14,8 @@ from cairn_map.commits.ids import Author, CommitId, Incarnation, RobotName
 
 AGAIN_SHARE = 0.1
 """Share of pushes after which an old commit is pushed again, late."""
+LATER = (503, 507)
+"""Statuses that a robot may get: it is to come again."""
 PAUSE_S = 0.1
 TIMEOUT_S = 15.0
 
@@ -25,7 +27,7 @@ class Pushed:
     offered: dict[CommitId, Commit] = field(default_factory=dict)
     acked: set[CommitId] = field(default_factory=set)
     answers: dict[str, int] = field(default_factory=dict)
-    """Count of each answer: a status, or an exception's name."""
+    """Count of each answer: a status with the problem's kind, or an exception's name."""
     wrong: list[str] = field(default_factory=list)
     """Answers that must not be."""
     last_s: float = field(default_factory=time.monotonic)
@@ -80,7 +82,8 @@ class Pusher:
             self._pushed.note(type(exc).__name__)
             return False
         is_kept = answer.status_code in (200, 201)
-        self._pushed.note(str(answer.status_code), commit if is_kept else None)
-        if not is_kept and answer.status_code != 503:
+        kind = "" if is_kept else f" {answer.json().get('kind')}"
+        self._pushed.note(f"{answer.status_code}{kind}", commit if is_kept else None)
+        if not is_kept and answer.status_code not in LATER:
             self._pushed.wrong.append(f"{commit.id}: {answer.status_code} {answer.text[:200]}")
         return is_kept

@@ -3,6 +3,7 @@
 import signal
 import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -30,6 +31,8 @@ class Site:
     postgres: PostgresServer
     database: str
     options: tuple[str, ...] = ()
+    store: str | None = None
+    """URL of the store, if it is not that of the database alone."""
     members: list[Member] = field(default_factory=list)
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
@@ -40,11 +43,18 @@ class Site:
         self.start(member)
         return member
 
+    def add_all(self, *roles: str) -> None:
+        """Start several processes at once."""
+        members = [Member(role, len(self.members) + n) for n, role in enumerate(roles)]
+        self.members += members
+        with ThreadPoolExecutor() as pool:
+            list(pool.map(self.start, members))
+
     def start(self, member: Member) -> None:
         """Start a process in a new folder: it keeps nothing there."""
         member.starts += 1
         folder = self.folder / f"{member.role}{member.number}-{member.starts}"
-        store = self.postgres.url(self.database)
+        store = self.store or self.postgres.url(self.database)
         process = Process(folder, "--store", store, *OPTIONS[member.role], *self.options)
         assert process.url, process.end()
         with self._lock:

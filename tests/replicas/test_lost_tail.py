@@ -1,4 +1,4 @@
-"""A short run of `tests.replicas lost-tail`: a map is lost, the order of commits, and the newest ones."""
+"""A short run of `tests.replicas lost-tail`: the order of commits is lost, and the newest ones."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ pytestmark = [pytest.mark.processes, pytest.mark.slow]
 
 
 def test_servers_and_robots_go_on_when_the_newest_commits_are_lost(tmp_path: Path) -> None:
-    found = lost_tail_run(tmp_path, programs_of(WHEEL), seeds=range(3))
+    found = lost_tail_run(tmp_path, programs_of(WHEEL), seeds=range(1, 3))
     said = "\n".join(f"{what}: {value}" for what, value in found.rows())
     assert found.is_sound, said
     assert found.frames["delta"] > 20 and found.frames["reset"] > 0, said

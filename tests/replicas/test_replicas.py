@@ -1,10 +1,12 @@
-"""A short run of `tests.replicas`: each kind of fault against two servers and two that fold, and the verdict."""
+"""Short runs of `tests.replicas`: faults of servers, of a link and of a disk, and the verdict on the store."""
 
 from pathlib import Path
 
 import pytest
 from tests.fixtures.server.postgres import SYSTEM, WHEEL, programs_of
+from tests.replicas.cut_link import cut_link_run
 from tests.replicas.fault_run import SILENCE_MAX_S, fault_run
+from tests.replicas.full_disk import full_disk_run
 
 pytestmark = [pytest.mark.processes, pytest.mark.slow]
 
@@ -16,3 +18,17 @@ def test_nothing_that_was_acknowledged_is_lost_or_folded_twice(kind: str, seed: 
     assert found.verdict.is_sound and not found.pushed.wrong, said
     assert len(found.pushed.acked) > 50, said
     assert found.pushed.silence_s < SILENCE_MAX_S, said
+
+
+def test_a_server_that_is_cut_off_from_the_database_says_so_and_works_again(tmp_path: Path) -> None:
+    found = cut_link_run(tmp_path, programs_of(WHEEL), seconds=6.0, robots=2, seed=1)
+    said = "\n".join(f"{what}: {value}" for what, value in found.rows())
+    assert found.is_sound, said
+    assert found.pushed.answers["503 store_failed"] > 5 and len(found.pushed.acked) > 50, said
+
+
+def test_a_full_disk_of_the_database_refuses_commits_until_there_is_room(tmp_path: Path) -> None:
+    found = full_disk_run(tmp_path, programs_of(WHEEL), what="tables", seconds=4.0, robots=2, seed=1)
+    said = "\n".join(f"{what}: {value}" for what, value in found.rows())
+    assert found.is_sound, said
+    assert found.pushed.answers["507 disk_full"] > 5 and len(found.pushed.acked) > 20, said

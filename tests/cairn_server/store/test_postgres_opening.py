@@ -18,6 +18,7 @@ from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.folding.cell_cache import CellCache
 from cairn_server.folding.folding import fold_pending
 from cairn_server.store.postgres import schema
+from cairn_server.store.postgres.connections import connect
 from cairn_server.store.postgres.schema import STEPS, Step
 from cairn_server.store.postgres.store import PgStore
 
@@ -162,6 +163,16 @@ def test_a_lost_connection_is_reported_and_the_next_call_has_a_fresh_one(
         store.append(row, new_of(pushed(1, 1)))
     assert refused.value.kind == "store_failed" and refused.value.retry_after_s
     assert store.append(row, new_of(pushed(1, 1)))
+
+
+def test_connections_give_a_cut_link_up_after_seconds_unless_the_url_says_another_time(
+    postgres_database: Database,
+) -> None:
+    for url, idle_s in ((postgres_database.url, "5"), (f"{postgres_database.url}?keepalives_idle=60", "60")):
+        with connect(url) as connection:
+            stated = connection.info.get_parameters()
+        assert (stated["keepalives_idle"], stated["tcp_user_timeout"]) == (idle_s, "10000")
+        assert stated["target_session_attrs"] == "read-write"
 
 
 def test_a_snapshot_whose_connection_is_lost_is_reported(store: PgStore, postgres_database: Database) -> None:

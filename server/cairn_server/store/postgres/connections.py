@@ -30,6 +30,8 @@ WAIT_S = 10.0
 """Time for which a thread waits for a connection while all are lent."""
 CONNECT_S = 5
 """Time in which the database has to accept a connection, unless its URL says another."""
+LINK = {"keepalives_idle": 5, "keepalives_interval": 2, "keepalives_count": 3, "tcp_user_timeout": 10_000}
+"""libpq's options by which a connection over a cut link fails after some 10 s, not after TCP's quarter of an hour."""
 PRIMARY = "read-write"
 """libpq's `target_session_attrs` of all connections of a store: of several servers the one that takes commits."""
 PREPARE_AFTER = 2
@@ -66,13 +68,13 @@ def connect_to_any(url: str, settings: str = "", **options: str) -> Connection:
         psycopg.Error: it cannot be had.
     """
     stated = conninfo.conninfo_to_dict(url)
-    wait = {} if "connect_timeout" in stated else {"connect_timeout": CONNECT_S}
+    defaults = {name: value for name, value in {"connect_timeout": CONNECT_S, **LINK}.items() if name not in stated}
     made = psycopg.connect(
         url,
         autocommit=True,
         prepare_threshold=PREPARE_AFTER,
         application_name="cairn",
-        **(wait | options),  # type: ignore[arg-type]
+        **(defaults | options),  # type: ignore[arg-type]
     )
     try:
         made.execute(f"{SETTINGS}; {settings}".encode())
