@@ -179,14 +179,18 @@ def memory_metrics(limit_bytes: int) -> Iterator[Metric]:
     yield GaugeMetricFamily("cairn_memory_bytes", "Memory that all processes take together.", used_bytes())
 
 
+def program_version() -> str:
+    """Version of cairn, `unknown` where it runs from its sources."""
+    try:
+        return version("cairn-robotics")
+    except PackageNotFoundError:
+        return "unknown"
+
+
 def process_metrics() -> Iterator[Metric]:
     """Version, processor time, memory and open files of this process, under the names that all exporters use."""
-    try:
-        text = version("cairn-robotics")
-    except PackageNotFoundError:
-        text = "unknown"
     build = GaugeMetricFamily("cairn_build_info", "Always 1; the version is the label.", labels=["version"])
-    build.add_metric([text], 1)
+    build.add_metric([program_version()], 1)
     yield build
     times = os.times()
     yield CounterMetricFamily("process_cpu_seconds_total", "Processor time used.", round(times.user + times.system, 2))

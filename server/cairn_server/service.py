@@ -28,6 +28,7 @@ from cairn_server.live.fold_news import FoldNews
 from cairn_server.live.hub import Hub
 from cairn_server.live.replica_watch import ReplicaWatch
 from cairn_server.live.robot_reports import RobotReports
+from cairn_server.live.site import Site
 from cairn_server.maps import Maps
 from cairn_server.metrics import (
     ServerFigures,
@@ -99,9 +100,11 @@ class Service:
         self.live = Hub(store, connections=settings.limit_concurrency)
         self.reports = RobotReports(store, self.live)
         self.fold_news = FoldNews()
+        self._fold_thread: FoldThread | None = None
+        self.site = Site(store, answers=settings.folding != "only", is_folding=self._folds)
         self.watch: ReplicaWatch | None = None
         if store.replicas is not None:
-            self.watch = ReplicaWatch(store, store.replicas, self.live, self.reports, self.fold_news)
+            self.watch = ReplicaWatch(store, store.replicas, self.live, self.reports, self.fold_news, self.site)
         self.maps = Maps(store, self.live, self.reports, settings.memory)
         self.maps.warn_of_large_cells()
 
@@ -109,7 +112,6 @@ class Service:
         remove_spools(settings.folder)
         upstream = UpstreamProgress(store.age, settings.upstream, store.replicas)
         damaged, folds = DamagedCells(), FoldHealth(self.figures)
-        self._fold_thread: FoldThread | None = None
         if settings.folding != "elsewhere":
             self._fold_thread = FoldThread(
                 store,
@@ -162,12 +164,17 @@ class Service:
 
     def _folded(self, row: MapRow) -> None:
         """Tell of a fold by this server."""
+        self.site.folded()
         self.fold_news.note(row.number)
         self.live.folded(row)
 
     def _wake_folding(self) -> None:
         if self._fold_thread is not None:
             self._fold_thread.wake()
+
+    def _folds(self) -> bool:
+        """True while this server folds."""
+        return self._fold_thread is not None and self._fold_thread.is_alive()
 
     def _is_folding(self) -> bool:
         """True unless what came is to be folded here, and cannot."""
@@ -204,5 +211,6 @@ class Service:
             self._fold_thread.close()
         if self.watch is not None:
             self.watch.close()
+        self.site.leave()
         self.reports.close()
         self.store.close()

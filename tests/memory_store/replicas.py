@@ -4,15 +4,17 @@ import secrets
 import threading
 from collections.abc import Collection, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from tests.memory_store.maps import MemoryMaps
 
 from cairn_map.errors import UnreachableError
 from cairn_server.store.replica_notes import (
+    SERVER_S,
     BodyPart,
     BodyPlace,
     NotedReport,
+    NotedServer,
     OnHint,
     ReplicaNotes,
     RobotView,
@@ -35,6 +37,7 @@ class MemoryReplicaNotes:
         self.tickets = MemoryTickets(clocks)
         self.bodies = MemoryBodies(clocks)
         self.uses = MemoryUseAccounts(clocks)
+        self.servers = MemoryServers(clocks)
         self.secret = secrets.token_bytes(32)
         self._handed_over: dict[tuple[str, str], float] = {}
         self._maps = maps
@@ -51,6 +54,33 @@ class MemoryReplicaNotes:
     def handed_over(self, upstream: str) -> Mapping[str, float]:
         """Ages by the map's name."""
         return {name: age_s for (url, name), age_s in list(self._handed_over.items()) if url == upstream}
+
+
+class MemoryServers:
+    """`replica_notes.NotedServers`."""
+
+    def __init__(self, clocks: Clocks) -> None:
+        self._clocks = clocks
+        self._kept: dict[str, tuple[NotedServer, float]] = {}
+
+    def put(self, sign: NotedServer, *, wall_s: float) -> None:
+        """Keep the sign of a server."""
+        noted = replace(sign, clock_ahead_s=wall_s - self._clocks.wall_s())
+        self._kept[sign.id] = noted, self._clocks.steady_s()
+
+    def all(self) -> list[NotedServer]:
+        """Servers that gave a sign of late."""
+        found = []
+        for sign, at_s in list(self._kept.values()):
+            heard_s = self._clocks.steady_s() - at_s
+            folded_s = None if sign.folded_s is None else sign.folded_s + heard_s
+            if heard_s < SERVER_S:
+                found.append(replace(sign, heard_s=heard_s, folded_s=folded_s))
+        return sorted(found, key=lambda sign: sign.id)
+
+    def remove(self, server: str) -> None:
+        """Drop a server."""
+        self._kept.pop(server, None)
 
 
 class MemoryFoldHints:

@@ -12,15 +12,21 @@
     ok    clock         the server's agrees with ours, to within 1.0 s
     ok    ready         takes pushes and folds them
     ok    token         no token: map lab may be read; 34 cells, 15 commits
+    ok    store         5f0c2d1be07a3c44, shared; 2 of its servers answered here
+    ok    servers       3: 2 answer, 1 fold; version 0.1.0
+    ok    folding       no commit waits; the last fold was 3 s ago
+    ok    clocks        the servers' differ from the database's by at most 0.01 s
     ok    speed         48.1 MB/s down: a cell of 212.0 kB in 4 ms
 
-Without an argument the installation alone is checked; with a server's or a map's URL, the way there as well; with a
+Without an argument the installation alone is checked; with a server's or a map's URL, the way there as well, and the
+servers behind that address: whether they share one store, how many answer and fold, their versions and clocks. Further
+URLs, such as the servers' own behind a proxy, are compared with the first: all have to be of one store. With a
 state folder (of a robot, or of `cairn clone`), its content, and of a copy the way to its server. A line that is not
 `ok` has the next step below it. The exit code is 0 if nothing failed (there may be warnings), else 1.
 """
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -34,6 +40,7 @@ from cairn_client.cli.doctor_checks import (
     installation_checks,
     server_checks,
 )
+from cairn_client.cli.doctor_site import site_checks
 from cairn_client.folders.state_folder import opened_replica
 from cairn_client.http.api import MapApi
 from cairn_client.http.map_url import split_map_url
@@ -49,11 +56,12 @@ def main(argv: list[str]) -> int:
     """Run the checks."""
     command = parser("cairn doctor", __doc__)
     command.add_argument("target", nargs="?", metavar="URL|DIR", help="a server, a map, or a state folder")
+    command.add_argument("others", nargs="*", metavar="URL", help="more addresses of the same servers")
     command.add_argument("--json", action="store_true", help="print JSON")
     add_token(command)
     args = command.parse_args(argv)
     checks: list[Check] = []
-    for check in _checks(args.target, args.token):
+    for check in _checks(args.target, args.others, args.token):
         checks.append(check)
         if not args.json:
             _show(check)
@@ -62,12 +70,12 @@ def main(argv: list[str]) -> int:
     return ILL if any(check.verdict is CheckResult.FAIL for check in checks) else SOUND
 
 
-def _checks(target: str | None, tokens: OriginTokens) -> Iterator[Check]:
+def _checks(target: str | None, others: list[str], tokens: OriginTokens) -> Iterator[Check]:
     yield from installation_checks()
     if target is None or "://" in target:
         yield disk_check(Path())
     if target is not None and "://" in target:
-        yield from _of_url(target, tokens.of(target))
+        yield from _of_url(target, tokens.of(target), [(other, tokens.of(other)) for other in others])
     elif target is not None:
         yield from folder_checks(Path(target))
         link = _link_of(Path(target))
@@ -79,9 +87,17 @@ def _checks(target: str | None, tokens: OriginTokens) -> Iterator[Check]:
                 yield grid_check(api, name, link.geometry)
 
 
-def _of_url(url: str, token: str | None) -> Iterator[Check]:
-    server, name = split_map_url(url) if "/maps/" in url else (url, None)
-    yield from server_checks(server, name, token=token)
+def _of_url(url: str, token: str | None, others: Sequence[tuple[str, str | None]] = ()) -> Iterator[Check]:
+    """Checks of a server or map, and of more addresses of the same servers, each with its token."""
+    server, name = _server_of(url)
+    for check in server_checks(server, name, token=token):
+        yield check
+        if check.what == "token" and check.verdict is CheckResult.OK:
+            yield from site_checks([(server, token), *((_server_of(url)[0], own) for url, own in others)])
+
+
+def _server_of(url: str) -> tuple[str, str | None]:
+    return split_map_url(url) if "/maps/" in url else (url, None)
 
 
 @dataclass(frozen=True, slots=True)

@@ -36,6 +36,7 @@ from cairn_map.wire.access_messages import (
     RobotClosed,
     RobotKeyList,
     RobotUse,
+    SiteInfo,
     TokenInfo,
 )
 from cairn_map.wire.frames import FRAME_BYTES_MAX, JSON_BYTES_MAX, Frame
@@ -197,6 +198,10 @@ class MapApi:
     def maps(self) -> list[MapInfo]:
         """All maps."""
         return list_of(MapInfo, self._ask("GET", "/maps"))
+
+    def site(self) -> SiteInfo:
+        """Servers of the store of the server that answers."""
+        return message_from_json(SiteInfo, self._ask("GET", "/servers"))
 
     def map_info(self, name: str) -> MapInfo:
         """One map."""

@@ -1,4 +1,4 @@
-"""JSON messages of access control: tokens, and the audit log with its chain of hashes."""
+"""JSON messages of operation: tokens, the servers of a store, and the audit log with its chain of hashes."""
 
 import hashlib
 import json
@@ -53,6 +53,39 @@ class TokenInfo(_Model):
     """Time of its last use, UTC seconds since 1970; updated every few seconds at most."""
     confirmed: bool = True
     """False after a restore, until an admin confirms that the token still counts."""
+
+
+class ServerInfo(_Model):
+    """One server of a store, as it was heard of last."""
+
+    id: str
+    """16 hex digits, drawn at its start."""
+    answers: bool
+    """False for one that only folds."""
+    folds: bool
+    """True if it folds, and its thread that does is alive."""
+    version: str
+    clock_ahead_s: float
+    """Lead of its clock over the store's; 0 where it has the store alone."""
+    folded_s: float | None
+    """Seconds since its last fold; None: it made none yet."""
+    heard_s: float
+    """Seconds since it was heard of."""
+
+
+class SiteInfo(_Model):
+    """Answer of `GET /servers`: the servers of one store."""
+
+    store: Literal["one process", "shared"]
+    """Kind of the store: the server's alone (SQLite), or a database of several (PostgreSQL)."""
+    store_id: str
+    """16 hex digits: the same at all servers of a shared store; else drawn at the start."""
+    server_id: str
+    """The one that answers."""
+    servers: list[ServerInfo]
+    """Those heard of within the last half minute, this one included, by id."""
+    waiting_s: float
+    """Seconds for which the oldest commit has waited to be folded; 0: none waits."""
 
 
 class RobotUse(_Model):

@@ -4,6 +4,7 @@
     every second         -->  heads                -->  Hub.folded
                          -->  signs of robots      -->  Hub.present_robots
                          <--  own robots' reports that others cannot see yet
+    every ten seconds    <--  sign that this server is alive
     every minute         <->  age of the store
 
 A look costs one query of the heads, and two of the robots, of maps that have listeners; without listeners none. Looks
@@ -20,13 +21,15 @@ from cairn_map.errors import CairnError
 from cairn_server.live.fold_news import FoldNews
 from cairn_server.live.hub import Hub
 from cairn_server.live.robot_reports import RobotReports
-from cairn_server.store.replica_notes import FoldHint, ReplicaNotes
+from cairn_server.live.site import Site
+from cairn_server.store.replica_notes import SERVER_S, FoldHint, ReplicaNotes
 from cairn_server.store.store import Store
 from cairn_server.store.store_rows import MapRow
 
 log = logging.getLogger(__name__)
 
 LOOK_EVERY_S = 1.0
+SIGN_EVERY_S = SERVER_S / 3
 KEEP_AGE_EVERY_S = 60.0
 """Time between two looks at the age that other servers count: a server that does not fold has no other reason to."""
 NEWS_EVERY_S = 60.0
@@ -45,19 +48,22 @@ class ReplicaWatch:
         hub: Hub,
         reports: RobotReports,
         news: FoldNews,
+        site: Site,
         *,
         every_s: float = LOOK_EVERY_S,
     ) -> None:
-        """Begin; `notes` are the store's, and `news` hears of all folds."""
+        """Begin; `notes` are the store's, `news` hears of all folds, and `site` tells of this server."""
         self._store = store
         self._hub = hub
         self._reports = reports
         self._news = news
+        self._site = site
         self._every_s = every_s
         self._seen: dict[int, Cursor] = {}
         """State of each map that listeners were last woken for."""
         self._hinted: set[int] = set()
         """Numbers of maps with listeners that were folded, by hints since the last look."""
+        self._sign_next_s = -math.inf
         self._keep_age_next_s = -math.inf
         self._news_next_s = -math.inf
         self._woken = threading.Event()
@@ -89,6 +95,9 @@ class ReplicaWatch:
         Raises:
             CairnError: the store cannot be read now.
         """
+        if time.monotonic() >= self._sign_next_s:
+            self._sign_next_s = time.monotonic() + SIGN_EVERY_S
+            self._site.sign()
         if time.monotonic() >= self._keep_age_next_s:
             self._keep_age_next_s = time.monotonic() + KEEP_AGE_EVERY_S
             self._store.keep_age()

@@ -9,6 +9,7 @@ and the use of quotas apart.
     tickets   exports that were asked for and not fetched yet
     bodies    beginnings of commits that come in parts
     uses      use of the quotas, and token buckets
+    servers   servers that are alive
 
 Hints of folds are no notes: a server that folds says so to all, and one that misses it sees the new head when it looks.
 """
@@ -214,6 +215,42 @@ class UseAccounts(Protocol):
         ...
 
 
+SERVER_S = 30.0
+"""Seconds for which a server counts as alive after its last sign."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NotedServer:
+    """Sign of a server of the store."""
+
+    id: str
+    answers: bool
+    folds: bool
+    version: str
+    clock_ahead_s: float = 0.0
+    """Lead of its clock over the store's."""
+    folded_s: float | None
+    """Seconds since its last fold; None: it made none."""
+    heard_s: float = 0.0
+    """Seconds since the sign."""
+
+
+class NotedServers(Protocol):
+    """Servers of the store."""
+
+    def put(self, sign: NotedServer, *, wall_s: float) -> None:
+        """Keep the sign of a server, given now, whose clock says `wall_s`."""
+        ...
+
+    def all(self) -> list[NotedServer]:
+        """Servers that gave a sign within `SERVER_S`, by id."""
+        ...
+
+    def remove(self, server: str) -> None:
+        """Drop a server that ends."""
+        ...
+
+
 class FoldHint(NamedTuple):
     """Hint that a server folded."""
 
@@ -261,6 +298,11 @@ class ReplicaNotes(Protocol):
     @property
     def uses(self) -> UseAccounts:
         """Use of the quotas."""
+        ...
+
+    @property
+    def servers(self) -> NotedServers:
+        """Servers that are alive."""
         ...
 
     @property

@@ -5,10 +5,10 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Query
 from fastapi.responses import PlainTextResponse
 
-from cairn_map.wire.access_messages import AuditEntry, CreateToken, NewSecret, TokenInfo
+from cairn_map.wire.access_messages import AuditEntry, CreateToken, NewSecret, SiteInfo, TokenInfo
 from cairn_server.access.auth import Caller
 from cairn_server.access.tokens import confirm_token, create_token, list_tokens, revoke_token, rotate_token
-from cairn_server.http.routes.callers import ADMIN, Asking, Operations, admin
+from cairn_server.http.routes.callers import ADMIN, Asking, Operations, admin, reader_somewhere
 from cairn_server.http.routes.documentation import json_body, problems
 from cairn_server.http.routes.json_bodies import json_of
 from cairn_server.metrics import MEDIA_TYPE
@@ -43,6 +43,12 @@ def readyz(service: Operations) -> dict[str, str]:
 def metrics(service: Operations) -> PlainTextResponse:
     """Figures for Prometheus."""
     return PlainTextResponse(service.metrics_text(), media_type=MEDIA_TYPE)
+
+
+@router.get("/servers", dependencies=[Depends(reader_somewhere)])
+def get_servers(service: Operations) -> SiteInfo:
+    """Servers of this one's store that are alive."""
+    return service.site.info()
 
 
 @router.get("/tokens", dependencies=ADMIN)

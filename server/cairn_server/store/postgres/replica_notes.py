@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Collection, Mapping
 from contextlib import closing
+from dataclasses import asdict, fields
 from typing import Any
 
 import psycopg
@@ -22,12 +23,15 @@ from cairn_map.errors import CairnError
 from cairn_server.store.postgres.branches import PgBranches
 from cairn_server.store.postgres.connections import Connection, Connections, connect, first, rows
 from cairn_server.store.postgres.folds import CHANNEL
+from cairn_server.store.postgres.schema import NOW_S
 from cairn_server.store.postgres.use_accounts import PgUseAccounts
 from cairn_server.store.replica_notes import (
+    SERVER_S,
     BodyPart,
     BodyPlace,
     FoldHint,
     NotedReport,
+    NotedServer,
     OnHint,
     RobotView,
     StagedBody,
@@ -66,6 +70,7 @@ class PgReplicaNotes:
         self.tickets = PgTickets(noting)
         self.bodies = PgBodies(noting)
         self.uses = PgUseAccounts(noting)
+        self.servers = PgServers(noting)
         self.secret: bytes = connections.run(_secret)
 
     def fold_hints(self, on_hint: OnHint) -> "PgFoldHints":
@@ -201,6 +206,44 @@ class PgBodies:
     def drop(self, place: BodyPlace) -> None:
         """Drop what is at a place."""
         self._noting.run(lambda connection: _drop(connection, place))
+
+
+class PgServers:
+    """`replica_notes.NotedServers`, by the database's clock."""
+
+    def __init__(self, noting: Connections) -> None:
+        self._noting = noting
+
+    def put(self, sign: NotedServer, *, wall_s: float) -> None:
+        """Keep the sign of a server."""
+        query = (
+            "INSERT INTO server (id, answers, folds, version, clock_ahead_s, folded_at, heard_at)"
+            f" SELECT %(id)s, %(answers)s, %(folds)s, %(version)s, %(wall_s)s::float8 - {NOW_S},"
+            " clock_timestamp() - make_interval(secs => %(folded_s)s::float8), clock_timestamp()"
+            " ON CONFLICT (id) DO UPDATE SET folds = excluded.folds, clock_ahead_s = excluded.clock_ahead_s,"
+            " folded_at = excluded.folded_at, heard_at = excluded.heard_at"
+        )
+        with self._noting.lent() as connection:
+            connection.execute("DELETE FROM server WHERE heard_at < clock_timestamp() - interval '1 hour'")
+            connection.execute(query.encode(), asdict(sign) | {"wall_s": wall_s})
+
+    def all(self) -> list[NotedServer]:
+        """Servers that gave a sign of late."""
+        now = "clock_timestamp()"
+        ages = ", ".join(f"extract(epoch FROM {now} - {name})::float8" for name in ("folded_at", "heard_at"))
+        query = (
+            f"SELECT id, answers, folds, version, clock_ahead_s, {ages} FROM server"
+            " WHERE heard_at > clock_timestamp() - make_interval(secs => %s::float8) ORDER BY id"
+        )
+        names = [each.name for each in fields(NotedServer)]
+        with self._noting.lent() as connection:
+            found = rows(connection, query, (SERVER_S,))
+        return [NotedServer(**dict(zip(names, row, strict=True))) for row in found]
+
+    def remove(self, server: str) -> None:
+        """Drop a server."""
+        with self._noting.lent() as connection:
+            connection.execute("DELETE FROM server WHERE id = %s", (server,))
 
 
 class PgFoldHints:

@@ -289,6 +289,18 @@ CREATE TABLE handed_over (upstream text, map_name text, age_s float8 NOT NULL, P
 CREATE TABLE shared_secret (one boolean PRIMARY KEY CHECK (one), secret bytea NOT NULL);
 """
 
+SERVERS = """
+CREATE UNLOGGED TABLE server (                      -- those alive, each heard of every some seconds
+    id text COLLATE "C" PRIMARY KEY,
+    answers boolean NOT NULL,
+    folds boolean NOT NULL,
+    version text NOT NULL,
+    clock_ahead_s float8 NOT NULL,
+    folded_at timestamptz,
+    heard_at timestamptz NOT NULL
+) WITH (fillfactor = 50);
+"""
+
 
 @dataclass(frozen=True, slots=True)
 class Step:
@@ -299,7 +311,7 @@ class Step:
     """Number of the oldest step whose programs work on a database that took this one."""
 
 
-STEPS = (Step(FIRST, oldest=1), Step(REPLICAS, oldest=1))
+STEPS = (Step(FIRST, oldest=1), Step(REPLICAS, oldest=1), Step(SERVERS, oldest=1))
 
 
 def prepare(url: str) -> None:
