@@ -5,21 +5,20 @@ What this does not show: the containers' network, and certificates of others.
 
 import json
 import os
-import shutil
 import signal
-import ssl
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import httpx
 import pytest
 import yaml
 from tests.fixtures.map.made import SMALL
-from tests.fixtures.server.live import Process, free_port, until
+from tests.fixtures.server.caddy import CADDYFILE, HOST, Proxy, caddy_before, needs_caddy
+from tests.fixtures.server.live import Process, until
 from tests.fixtures.server.pushes import pushed
+from tests.fixtures.sources import ROOT
 from websockets.sync.client import connect
 from websockets.typing import Origin
 
@@ -30,87 +29,50 @@ from cairn_server.settings import Settings
 
 pytestmark = pytest.mark.processes
 
-ROOT = Path(__file__).parents[1]
-CADDYFILE = ROOT / "docker" / "Caddyfile"
 COMPOSE, SCALE = ROOT / "docker" / "compose.yaml", ROOT / "docker" / "compose.scale.yaml"
 ADMIN_TOKEN = "admin-of-the-proxy-test"
-SITE = "127.0.0.1"
-needs_caddy = pytest.mark.skipif(shutil.which("caddy") is None, reason="needs caddy (apt-get install caddy)")
-
-
-@dataclass(frozen=True)
-class Site:
-    """The server as others see it."""
-
-    url: str
-    http_url: str
-    authority: Path
-    """Certificate of who signed the site's."""
-
-    @property
-    def tls(self) -> ssl.SSLContext:
-        return ssl.create_default_context(cafile=self.authority)
-
-    @property
-    def api(self) -> MapApi:
-        return MapApi(self.url, token=ADMIN_TOKEN, ca_file=self.authority)
 
 
 @pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Site]:
+def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Proxy]:
     folder = tmp_path_factory.mktemp("proxy")
     (folder / "token").write_text(ADMIN_TOKEN)
     server = Process(folder / "data", "--admin-token-file", str(folder / "token"))
     assert server.url
-    https_port, http_port = free_port(SITE), free_port(SITE)
-    env = {
-        **{"PATH": os.environ["PATH"], "HOME": str(folder), "XDG_DATA_HOME": str(folder)},
-        **{"CAIRN_SITE": SITE, "CAIRN_BIND": SITE, "CAIRN_UPSTREAM": server.url.removeprefix("http://")},
-        **{"CAIRN_HTTPS_PORT": str(https_port), "CAIRN_HTTP_PORT": str(http_port)},
-    }
-    command = ["caddy", "run", "--config", str(CADDYFILE), "--adapter", "caddyfile"]
-    with (folder / "said").open("wb") as said, subprocess.Popen(command, env=env, stdout=said, stderr=said) as caddy:
-        try:
-            authority = folder / "caddy" / "pki" / "authorities" / "local" / "root.crt"
-            found = Site(f"https://{SITE}:{https_port}", f"http://{SITE}:{http_port}", authority)
-            until(lambda: caddy.poll() is not None or (authority.exists() and _answers(found)), "the proxy answers")
-            assert caddy.poll() is None, (folder / "said").read_text()
-            yield found
-        finally:
-            caddy.terminate()
-            caddy.wait(20)
-            server.send(signal.SIGTERM)
-            server.end()
-
-
-def _answers(site: Site) -> bool:
     try:
-        return httpx.get(f"{site.url}/healthz", verify=site.tls).status_code == 200
-    except (httpx.TransportError, ssl.SSLError):  # the authority's file is there before what it says
-        return False
+        with caddy_before([server.url.removeprefix("http://")], folder) as found:
+            yield found
+    finally:
+        server.send(signal.SIGTERM)
+        server.end()
+
+
+def api_of(site: Proxy) -> MapApi:
+    """The server as a client asks it through the proxy."""
+    return MapApi(site.url, token=ADMIN_TOKEN, ca_file=site.authority)
 
 
 @needs_caddy
-def test_the_page_comes_over_https_and_http_leads_to_it(site: Site) -> None:
+def test_the_page_comes_over_https_and_http_leads_to_it(site: Proxy) -> None:
     answer = httpx.get(f"{site.url}/", verify=site.tls)
     assert answer.status_code == 200
     assert "cairn" in answer.text
     assert "default-src 'none'" in answer.headers["Content-Security-Policy"]
     led = httpx.get(f"{site.http_url}/")
     assert led.status_code == 308
-    assert led.headers["Location"].startswith(f"https://{SITE}")
+    assert led.headers["Location"].startswith(f"https://{HOST}")
 
 
 @needs_caddy
-def test_who_does_not_know_the_authority_does_not_talk(site: Site) -> None:
+def test_who_does_not_know_the_authority_does_not_talk(site: Proxy) -> None:
     with pytest.raises(UnreachableError, match=r"(?i)certificate"):
         MapApi(site.url, token=ADMIN_TOKEN).maps()
 
 
 @needs_caddy
-def test_commits_and_live_news_pass_through_it(site: Site) -> None:
+def test_commits_and_live_news_pass_through_it(site: Proxy) -> None:
     commit = pushed(0, 0)
-    with site.api as api:
+    with api_of(site) as api:
         api.create_map("lab", CreateMap(geometry=SMALL))
         address = f"wss{site.url.removeprefix('https')}/maps/lab/live"
         headers = {"Authorization": f"Bearer {ADMIN_TOKEN}"}
@@ -124,8 +86,8 @@ def test_commits_and_live_news_pass_through_it(site: Site) -> None:
 
 
 @needs_caddy
-def test_a_copy_is_pulled_through_it_with_the_authority_in_the_environment(site: Site, tmp_path: Path) -> None:
-    with site.api as api:
+def test_a_copy_is_pulled_through_it_with_the_authority_in_the_environment(site: Proxy, tmp_path: Path) -> None:
+    with api_of(site) as api:
         api.create_map("hall", CreateMap(geometry=SMALL))
         api.push("hall", pushed(0, 1))
         until(lambda: bool(api.cell_index("hall").cells), "the commit is folded")

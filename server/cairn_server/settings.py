@@ -133,6 +133,9 @@ class Settings(BaseModel):
     """Seconds that any body may take to come, and any answer to be taken."""
     body_bytes_per_s: Annotated[float, Field(gt=0)] = 1000.0
     """Slowest link that is not cut once the grace has passed, bytes a second."""
+    drain_s: Annotated[float, Field(ge=0, le=3600)] = 0.0
+    """Seconds after the signal to stop for which all is still answered, while /healthz and /readyz say 503, so that a
+    proxy that looks there sends the rest to other servers; a second signal ends it. With one server: 0."""
     disk_free_min_bytes: Annotated[int, Field(ge=0)] = 64 << 20
     """Free space on the store's disk below which pushes are answered 507 and the server is not ready; what was
     acknowledged is folded into it."""

@@ -79,6 +79,11 @@ class Readiness:
         self._reasons: list[str] = []
         self._is_closing = False
 
+    @property
+    def is_closing(self) -> bool:
+        """True once the server was told to stop."""
+        return self._is_closing
+
     def close(self) -> None:
         """Be not ready from now on: the server is stopping."""
         self._is_closing = True

@@ -40,6 +40,7 @@ import resource
 import signal
 import socket
 import sys
+import threading
 from collections.abc import Callable
 from contextlib import AbstractContextManager, closing, nullcontext
 from types import FrameType
@@ -169,7 +170,11 @@ def _serve(service: Service, listener: socket.socket, long_bodies: LongBodies) -
 
 
 class _Server(uvicorn.Server):
-    """uvicorn's server, which at a signal says that it is not ready and ends what would not end alone or in time."""
+    """uvicorn's server, which at a signal says that it is not ready, and ends when proxies have noticed.
+
+    A connection that a proxy keeps and this side closes loses the request that is on its way just then, and a push that
+    meets a closed port may be answered 502: so all is answered until none is sent here any more.
+    """
 
     def __init__(self, config: uvicorn.Config, app: FastAPI) -> None:
         super().__init__(config)
@@ -177,7 +182,18 @@ class _Server(uvicorn.Server):
         self._turns: tuple[Lanes, Turns] = app.state.lanes, app.state.reading
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """End live streams, then stop as uvicorn does."""
+        """Say that the server stops, and stop it after a while, or at a second signal at once."""
+        drain_s = self._service.settings.drain_s
+        if drain_s and not self._service.readiness.is_closing:
+            self._service.readiness.close()
+            end = threading.Timer(drain_s, self._end, (sig, frame))
+            end.daemon = True
+            end.start()
+        else:
+            self._end(sig, frame)
+
+    def _end(self, sig: int, frame: FrameType | None) -> None:
+        """End live streams, which would not end alone or in time, then stop as uvicorn does."""
         self._service.stop_streams()
         super().handle_exit(sig, frame)
 

@@ -48,6 +48,7 @@ FLAGS = {
     "keep_evidence_s": ("--keep-evidence", "SECONDS"),
     "branch_expiry_s": ("--branch-expiry", "SECONDS"),
     "upstream": ("--upstream", "URL"),
+    "drain_s": ("--drain", "SECONDS"),
 }
 """Flag and name of the value of each setting that is given on the command line as it is."""
 SECRETS = {

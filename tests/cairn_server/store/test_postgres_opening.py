@@ -2,6 +2,7 @@
 
 import signal
 import socket
+import threading
 from collections.abc import Iterator
 from contextlib import closing
 
@@ -9,11 +10,12 @@ import pytest
 from tests.fixtures.map.made import SMALL
 from tests.fixtures.server.commit_contract import bodies, folded_map, new_map
 from tests.fixtures.server.crowd_contract import all_at_once
+from tests.fixtures.server.deadline import until
 from tests.fixtures.server.postgres import PASSWORD, Database, PostgresServer, new_database
-from tests.fixtures.server.pushes import pushed, read, sum_of
+from tests.fixtures.server.pushes import WREN, pushed, read, sum_of
 from tests.fixtures.server.store_contract import new_of
 
-from cairn_map.errors import BadInputError, UnreachableError
+from cairn_map.errors import BadInputError, CairnError, UnreachableError
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.folding.cell_cache import CellCache
 from cairn_server.folding.folding import fold_pending
@@ -219,3 +221,58 @@ def test_a_closed_store_says_so_and_notes_are_dropped_silently(postgres_database
         assert refused.value.kind == "shutting_down"
     with pytest.raises(UnreachableError):
         store.submit(row, new_of(pushed(0, 0)))
+
+
+NEXT = Step(
+    "ALTER TABLE commits ADD COLUMN added text; ALTER TABLE head ADD COLUMN added bigint NOT NULL DEFAULT 7;"
+    " ALTER TABLE cell ADD COLUMN added bytea; CREATE TABLE added (map bigint PRIMARY KEY)",
+    oldest=1,
+)
+"""A step that the next version could bring: it adds to the tables that are used most."""
+AFTER_NEXT = Step("DROP TABLE added", oldest=len(STEPS) + 1)
+"""The step after it, which takes away what only the version before it needs."""
+
+
+def test_a_server_goes_on_while_the_next_version_brings_its_step_and_works_beside_it(
+    postgres_database: Database, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    old, ended = PgStore(postgres_database.url), threading.Event()
+    row, failed, count = new_map(old, pushed(0, 0)), [], 0
+
+    def work() -> None:
+        nonlocal count
+        while not ended.is_set():
+            count += 1
+            try:
+                old.append(row, new_of(pushed(count, count % 5)))
+                fold_pending(old, row, CellCache(SMALL), limit=9)
+                bodies(old, row)
+            except CairnError as exc:
+                failed.append(exc)
+
+    worker = threading.Thread(target=work)
+    worker.start()
+    try:
+        until(lambda: count > 20, "statements are prepared")
+        with monkeypatch.context() as newer:
+            newer.setattr(schema, "STEPS", (*STEPS, NEXT))
+            with closing(PgStore(postgres_database.url)) as new:
+                before = count
+                for n in range(10):
+                    new.append(row, new_of(pushed(n, n % 5, WREN)))
+                    fold_pending(new, row, CellCache(SMALL), limit=9)
+                until(lambda: count > before + 20, "the old one goes on")
+    finally:
+        ended.set()
+        worker.join()
+    assert failed == []
+    with closing(PgStore(postgres_database.url)) as again:  # the old version starts again, too
+        while fold_pending(again, row, CellCache(SMALL), limit=99):
+            pass
+        everything = [pushed(n, n % 5) for n in range(count + 1)] + [pushed(n, n % 5, WREN) for n in range(10)]
+        assert read(bodies(again, row)) == sum_of(everything)
+    old.close()
+    with monkeypatch.context() as newer:
+        newer.setattr(schema, "STEPS", (*STEPS, NEXT, AFTER_NEXT))
+        PgStore(postgres_database.url).close()
+    assert refusal(postgres_database.url).kind == "store_version"

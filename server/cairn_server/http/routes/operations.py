@@ -5,6 +5,7 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Query
 from fastapi.responses import PlainTextResponse
 
+from cairn_map.errors import UnreachableError
 from cairn_map.wire.access_messages import AuditEntry, CreateToken, NewSecret, SiteInfo, TokenInfo
 from cairn_server.access.auth import Caller
 from cairn_server.access.tokens import confirm_token, create_token, list_tokens, revoke_token, rotate_token
@@ -20,9 +21,11 @@ Admin = Annotated[Caller, Depends(admin)]
 
 
 @router.get("/healthz")
-async def healthz() -> dict[str, str]:
-    """The process answers."""
+async def healthz(service: Operations) -> dict[str, str]:
+    """The process answers, and was not told to stop."""
     # On the event loop, without a lock or a thread: it says that the server can be reached, and nothing else.
+    if service.readiness.is_closing:
+        raise UnreachableError("shutting_down", "the server is stopping", retry_after_s=5.0)
     return {"status": "ok"}
 
 
