@@ -48,7 +48,7 @@ soak: .venv/dev.stamp .venv/kernels.stamp  ## crash, crowd, siege, replicas, sim
 	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.siege --seconds 30)
 	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.replicas --seconds $(SOAK_SECONDS))
 	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.replicas lost-tail --seeds 200)
-	$(if $(SOAK_ARGS),,for run in standby link disk log-disk; do $(BIN)/python -m tests.replicas $$run --seconds 60 || exit 1; done)
+	$(if $(SOAK_ARGS),,for run in standby link disk log-disk restore races; do $(BIN)/python -m tests.replicas $$run --seconds 60 || exit 1; done)
 	$(if $(SOAK_ARGS),,CAIRN_TEST_STORE=postgresql $(BIN)/python -m pytest $(WORKERS) tests/cairn_server/{sync,live,views,http} tests/cairn_client/{sync,relay})
 	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.sync_sim --seeds 100000)
 	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.links --minutes 30)

@@ -59,11 +59,11 @@ class FaultRun:
 
 
 @contextmanager
-def postgres_in(programs: Path) -> Iterator[PostgresServer]:
-    """A server of PostgreSQL in a folder of its own."""
+def postgres_in(programs: Path, *settings: str) -> Iterator[PostgresServer]:
+    """A server of PostgreSQL in a folder of its own, with more settings."""
     folder = Path(tempfile.mkdtemp(prefix="cairn-postgres-"))
     try:
-        server = PostgresServer(programs, folder)
+        server = PostgresServer(programs, folder, *settings)
         yield server
         server.stop()
     finally:

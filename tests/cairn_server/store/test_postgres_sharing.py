@@ -11,7 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from tests.fixtures.map.made import SMALL
-from tests.fixtures.server.commit_contract import bodies, folded_map, new_map
+from tests.fixtures.server.commit_contract import bodies, new_map
 from tests.fixtures.server.crowd_contract import all_at_once
 from tests.fixtures.server.live import until
 from tests.fixtures.server.postgres import Database, PostgresServer, new_database
@@ -170,26 +170,7 @@ def test_vectors_are_kept_at_marks(
             assert snapshot.vector_at(seq) == EMPTY.with_commits(pushed(n, n).id for n in range(seq))
 
 
-# What must not miss each other
-
-
-def test_a_retract_and_forgetting_at_once_never_leave_a_retract_without_its_evidence(
-    store: PgStore, other: PgStore
-) -> None:
-    def forget(row: MapRow) -> None:
-        other.forget_evidence(row, before_s=1e12, limit=9)
-
-    def retract(row: MapRow, target: Commit, taken: list[str | None]) -> None:
-        taken.append(refusal(store, row, new_of(pushed(0, 0, author_of(OPERATOR), cells={}, retracts=[target]))))
-
-    for turn in range(30):
-        target = pushed(0, turn)
-        row = folded_map(store, target)
-        taken: list[str | None] = []
-        all_at_once([partial(retract, row, target, taken), partial(forget, row)])
-        kept = store.commit(row, target.id)
-        assert kept is not None
-        assert (taken, kept.gone) in (([None], False), (["evidence_gone"], True))
+# What must not miss each other (a retract and forgetting: tests.replicas.races)
 
 
 def test_lines_of_two_servers_are_one_chain_of_which_the_newest_are_kept(
