@@ -81,7 +81,7 @@ class Readiness:
 
     @property
     def is_closing(self) -> bool:
-        """True once the server was told to stop."""
+        """True once the server got the signal to stop."""
         return self._is_closing
 
     def close(self) -> None:

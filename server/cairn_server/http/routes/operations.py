@@ -22,7 +22,7 @@ Admin = Annotated[Caller, Depends(admin)]
 
 @router.get("/healthz")
 async def healthz(service: Operations) -> dict[str, str]:
-    """The process answers, and was not told to stop."""
+    """The process answers, and got no signal to stop."""
     # On the event loop, without a lock or a thread: it says that the server can be reached, and nothing else.
     if service.readiness.is_closing:
         raise UnreachableError("shutting_down", "the server is stopping", retry_after_s=5.0)
