@@ -74,7 +74,7 @@ console: .venv/console.stamp  ## build the operator's page, which `cairn serve` 
 lock:  ## write the packages of the container image, with their hashes, to docker/*.lock (LOCK_ARGS=--upgrade)
 	@[[ -x build/lock/bin/uv ]] || { $(PYTHON) -m venv build/lock && build/lock/bin/pip install --quiet uv; }
 	$(LOCK) --extra server --output-file docker/server.lock pyproject.toml
-	$(LOCK) --extra server --extra postgresql --output-file docker/scale.lock pyproject.toml
+	$(LOCK) --extra server --extra postgresql --extra objects --output-file docker/scale.lock pyproject.toml
 	$(LOCK) --output-file docker/build.lock docker/build.in
 
 clean:  ## remove .venv, build/ and all caches

@@ -75,6 +75,7 @@ MAY_NAME = {
         "cairn_fusion/ros/db3_bag.py",
     ],
     "psycopg": ["cairn_server/store/postgres/*.py"],
+    "obstore": ["cairn_server/store/objects/bucket.py"],
     "cryptography": ["cairn_map/commits/signature.py", "cairn_server/access/own_names.py"],
     "laspy": ["cairn_map/files/laz.py", "cairn_fusion/clouds/cloud_file.py"],
     "lazrs": ["cairn_map/files/laz.py"],
@@ -105,8 +106,8 @@ ROOMS = {
     "cairn_sim": "scene render robots evaluation experiment study demo sim_command warm_up",
     "cairn_server": """
         memory_shares cell_room settings processes
-        store store.sqlite store.postgres metrics access live folding sync.checks sync views
-        maps service
+        store store.objects store.sqlite store.postgres store.settling
+        metrics access live folding sync.checks sync views maps service
         http.middleware http.routes http operations
     """,
 }

@@ -151,6 +151,4 @@ def test_the_compose_file_of_many_servers_names_what_is_there() -> None:
         for place in service["volumes"]:
             source = place.partition(":")[0]
             assert source in {*compose["volumes"], "/data"} or source.startswith(("./Caddyfile", "${CAIRN_CERTS"))
-    Settings.model_validate(
-        {"store": servers["folder"]["environment"]["CAIRN_STORE"], "folding": "only"}
-    ).check_folding()
+    Settings.model_validate({"store": servers["folder"]["environment"]["CAIRN_STORE"], "folding": "only"}).check_store()

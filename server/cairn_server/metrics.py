@@ -87,6 +87,18 @@ class ServerFigures:
         )
         self.fold_failures = self._counter("cairn_fold_failures_total", "Folds that failed and are tried again.", "map")
 
+        self.settled_bytes = self._counter(
+            "cairn_settled_bytes_total", "Bytes at rest that were moved to the object store.", "what"
+        )
+        self.objects_deleted = Counter(
+            "cairn_objects_deleted_total", "Objects out of use that were deleted.", registry=self.registry
+        )
+        self.settle_failures = Counter(
+            "cairn_settle_failures_total",
+            "Times that the object store did not take or delete what it should.",
+            registry=self.registry,
+        )
+
     def _counter(self, name: str, help_text: str, *labels: str) -> Bounded[Counter]:
         return Bounded(Counter(name, help_text, labels, registry=self.registry))
 

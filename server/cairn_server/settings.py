@@ -34,6 +34,12 @@ def _database(value: str) -> str:
     return value
 
 
+def _bucket(value: str) -> str:
+    if not value.startswith("s3://") or not value.removeprefix("s3://").partition("/")[0]:
+        raise ValueError("expected a URL like s3://BUCKET/PREFIX")
+    return value.rstrip("/")
+
+
 def _origins(value: str) -> str:
     try:
         return " ".join(origin_of(part) for part in value.split())
@@ -83,6 +89,19 @@ class Settings(BaseModel):
     store: Annotated[str, AfterValidator(_database)] | None = None
     """URL of a PostgreSQL database to keep the maps in, which any number of servers may share
     (postgresql://USER@HOST/NAME; its password in the file that PGPASSFILE names); default: SQLite in the folder."""
+    objects: Annotated[str, AfterValidator(_bucket)] | None = None
+    """URL of a bucket of an S3-compatible object store (s3://BUCKET/PREFIX), to which cells and evidence at rest move
+    from a database; its key and address from AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, AWS_REGION, AWS_ENDPOINT_URL."""
+    settle_cells_s: Annotated[float, Field(ge=0)] = 600.0
+    """Seconds without a change after which cells move to the object store."""
+    settle_evidence_s: Annotated[float, Field(ge=0)] = 86_400.0
+    """Seconds after folding at which a commit's evidence moves to the object store."""
+    objects_grace_s: Annotated[float, Field(ge=0)] = 86_400.0
+    """Seconds for which an object that is out of use is kept: more than the longest answer takes, a standby lags, and
+    the database may be set back by a restore (unless the bucket keeps versions for that long)."""
+    database_bytes_max: Annotated[int, Field(ge=1 << 20)] | None = None
+    """Room for the database, bytes, which it does not know itself: at 70 % of it a line is logged, from 95 % on pushes
+    are answered 507. Default: pushes are refused once the database's disk is full."""
     folding: Literal["here", "elsewhere", "only"] = "here"
     """Server that brings what came into the maps of a shared store: here; elsewhere: another one; only: this process
     does nothing else, and answers probes and metrics alone."""
@@ -176,8 +195,8 @@ class Settings(BaseModel):
         found = urlsplit(self.store)
         return urlunsplit(found._replace(netloc=found.netloc.rpartition("@")[2], query=""))
 
-    def check_folding(self) -> None:
-        """Refuse a role that needs other servers where there can be none.
+    def check_store(self) -> None:
+        """Refuse what is a database's where there is none: a role among other servers, an object store.
 
         Raises:
             BadInputError: kind `bad_setting`.
@@ -187,6 +206,12 @@ class Settings(BaseModel):
                 "bad_setting",
                 "--no-fold and --fold-only are for servers that share a database (--store postgresql://...); SQLite is "
                 "one process's",
+            )
+        if self.objects is not None and self.store is None:
+            raise BadInputError(
+                "bad_setting",
+                "--objects is for servers that keep their maps in a database (--store postgresql://...); SQLite keeps "
+                "everything in its folder",
             )
 
     def check_tls(self) -> None:

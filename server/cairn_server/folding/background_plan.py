@@ -116,7 +116,7 @@ class BackgroundPlan:
         # Whatever it is: folding without a plan meets it again, in the thread that can report it.
         with suppress(Exception):
             fold = plan_fold(self._store, self.row, self._head, self.commits, cache)
-            self._fold = None if fold.damaged else fold
+            self._fold = None if fold.damaged or fold.left else fold
         self.seconds = time.monotonic() - start_s
 
     def _ground_in(self, snapshot: Snapshot) -> _Ground:

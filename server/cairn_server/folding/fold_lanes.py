@@ -20,6 +20,7 @@ from cairn_server.folding.commit_work import NAME_S, SLICE_S, SLICE_S_PER_BYTE, 
 from cairn_server.folding.fold_memory import FoldMemory
 from cairn_server.folding.fold_turns import FoldTurns
 from cairn_server.folding.folding import FoldStore
+from cairn_server.store.objects.cold_bytes import AwayError
 from cairn_server.store.store_rows import MapRow, StoredCommit
 
 log = logging.getLogger(__name__)
@@ -176,7 +177,7 @@ class FoldLanes:
                     size_bytes += sum(map(len, known.diff.values()))
                     with self._store.snapshot(row) as snapshot:
                         work_s += commit_work_s(known, snapshot, cache)
-        except DamagedDataError:
+        except (DamagedDataError, AwayError):
             return _Weight(0.0, size_bytes)  # a cell that cannot be read: folding finds it
         return _Weight(work_s, size_bytes)
 

@@ -13,7 +13,7 @@ import logging
 from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from cairn_map.codec.cell_code import DecodedCell
 from cairn_map.commits.commit import commit_sha
@@ -27,6 +27,7 @@ from cairn_server.cell_room import voxels_of
 from cairn_server.folding.cell_cache import CellCache, Changed, Step
 from cairn_server.folding.cells_at_rest import cell_to_change, decode_stored, row_of_cell
 from cairn_server.folding.commit_work import part_of
+from cairn_server.store.objects.cold_bytes import AwayError
 from cairn_server.store.stamps import CellStamps
 from cairn_server.store.store import Snapshot
 from cairn_server.store.store_rows import CellRow, Entry, Fold, MapRow, RetractStep, StoredCommit
@@ -99,19 +100,28 @@ def fold_pending(store: FoldStore, row: MapRow, cache: CellCache, *, limit: int)
     Raises:
         DamagedDataError: a stored cell is damaged and cannot be rebuilt.
     """
-    return fold_commits(store, row, cache, store.pending(row, limit=limit, size_bytes_max=GROUP_BYTES_MAX))
+    return fold_commits(store, row, cache, store.pending(row, limit=limit, size_bytes_max=GROUP_BYTES_MAX)).folded
+
+
+class GroupOutcome(NamedTuple):
+    """GroupOutcome of folding some commits."""
+
+    folded: int = 0
+    """Count of the commits that were folded, set aside, or of whose retract a part was done."""
+    left: tuple[int, ...] = ()
+    """Numbers of those that stay pending (`Fold.left`)."""
 
 
 def fold_commits(
     store: FoldStore, row: MapRow, cache: CellCache, commits: Sequence[StoredCommit], *, order: Order = iter
-) -> int:
-    """Fold these pending commits, or those of them that `order` yields; returns their count.
+) -> GroupOutcome:
+    """Fold these pending commits, or those of them that `order` yields.
 
     Raises:
         DamagedCellError: a stored cell is damaged and cannot be rebuilt; nothing was folded.
     """
     if not commits:
-        return 0
+        return GroupOutcome()
     with store.snapshot(row) as snapshot:
         head = snapshot.head
         folded = {each.id for each in snapshot.named([commit.id for commit in commits]) if each.is_folded}
@@ -119,7 +129,7 @@ def fold_commits(
     # `store.fold` finds out.
     commits = [commit for commit in commits if commit.due_from is not None or commit.id not in folded]
     if not commits:
-        return 0
+        return GroupOutcome()
     # Plan in memory, and write all of it or nothing.
     cache.begin(head)
     written = False
@@ -131,11 +141,11 @@ def fold_commits(
         if not written:  # it failed, or another folding was faster, whose result is as good
             cache.clear()
     if not written:
-        return 0
+        return GroupOutcome()
     cache.finish(fold.head)
     audit_damaged(store, row, fold)
     begun = sum(entry.kind == ENTRY_FOLD for entry in fold.entries)
-    return len(fold.damaged) + begun + sum(step.before is not None for step in fold.steps)
+    return GroupOutcome(len(fold.damaged) + begun + sum(step.before is not None for step in fold.steps), fold.left)
 
 
 def audit_damaged(store: FoldStore, row: MapRow, fold: Fold) -> None:
@@ -157,6 +167,7 @@ def plan_fold(store: FoldStore, row: MapRow, head: Cursor, commits: Iterable[Sto
         retracted=tuple(plan.retracted),
         damaged=tuple(plan.damaged),
         steps=tuple(plan.steps),
+        left=tuple(plan.left),
     )
 
 
@@ -175,6 +186,7 @@ class _Plan:
     last_change: dict[CellKey, int] = field(default_factory=dict)
     damaged: list[tuple[int, str]] = field(default_factory=list)
     steps: list[RetractStep] = field(default_factory=list)
+    left: list[int] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.chain = self.start.chain
@@ -187,20 +199,30 @@ class _Plan:
             return
         with self.store.snapshot(self.map) as snapshot:
             part = part_of(commit, snapshot)
-        # Once for ever: a second retract of the same target, in this group or in the store, changes nothing.
-        for target in (each.id for each in part.named):
-            if not self._is_retracted(target):
+        due_from = part.due_from
+        for place, target in enumerate((each.id for each in part.named), start=commit.due_from or 0):
+            # Once for ever: a second retract of the same target, in this group or in the store, changes nothing.
+            if self._is_retracted(target):
+                continue
+            try:
                 self._retract(target)
-        if commit.due_from != part.due_from:
-            self.steps.append(RetractStep(commit.number, commit.due_from, part.due_from))
+            except AwayError:
+                self.left.append(commit.number)
+                due_from = place
+                break
+        if commit.due_from != due_from:
+            self.steps.append(RetractStep(commit.number, commit.due_from, due_from))
 
     def _begin(self, commit: StoredCommit) -> bool:
-        """Add a commit's own entry; False if it is damaged."""
+        """Add a commit's own entry; False if it is damaged, or has to wait for bytes of its cells."""
         try:
             self._enter(ENTRY_FOLD, commit)
         except DamagedCommitError as exc:
             log.error("commit %s is set aside: %s", commit.id, exc.message)
             self.damaged.append((commit.number, exc.message))
+            return False
+        except AwayError:
+            self.left.append(commit.number)
             return False
         self.folded[commit.id] = commit
         # Retracted before it came: both entries stand in the log, so that every robot sees the same history.
@@ -252,7 +274,7 @@ class _Plan:
                 digests.append(digest)
             if commit_sha(commit.text, digests) != commit.sha:
                 raise DamagedCommitError("damaged_store", f"commit {commit.id} at rest does not have its SHA-256")
-        except DamagedCommitError:
+        except (DamagedCommitError, AwayError):
             for key in done:
                 self._change(key, commit.diff[key], undo, commit)
             raise

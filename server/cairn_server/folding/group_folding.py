@@ -10,7 +10,7 @@ wait, and of a map where very many do, the later commits wait, too.
 import logging
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from cairn_map.commits.ids import RobotName
@@ -23,6 +23,7 @@ from cairn_server.folding.fold_lanes import FoldLanes
 from cairn_server.folding.fold_memory import FoldMemory
 from cairn_server.folding.fold_turns import FoldTurns
 from cairn_server.folding.folding import GROUP_BYTES_MAX, Damage, FoldStore, Order, fold_commits
+from cairn_server.store.objects.cold_bytes import AwayError
 from cairn_server.store.store_rows import MapRow, StoredCommit
 
 log = logging.getLogger(__name__)
@@ -35,6 +36,8 @@ WAITING_MAX = 2048
 """Most commits of a map that wait while later ones of the same robots are folded: 70 kB in each reply's vector."""
 PLAN_SHARE = 0.25
 """Share of the memory for cells under change that plans in the background have."""
+AWAY_S = 5.0
+"""Time after which commits are tried again that wait for bytes in an object store."""
 PROBE_S = 60.0
 """Time between two attempts to read a damaged cell again while none is reported as healed."""
 
@@ -50,6 +53,8 @@ class Waiting:
     """Count of these commits, by robot."""
     why: DamagedCellError | None = None
     """Error of the cell found last; None: no cell is damaged."""
+    away_s: float | None = None
+    """Steady time at which an object store did not give what some of these commits need; None: none needs it."""
     healed: int = 0
     """Count `Damage.healed` at the last look; taken before the look, so that no healing falls between."""
     probed_s: float = 0.0
@@ -74,8 +79,26 @@ class Waiting:
                 ready.append(commit)
         return ready
 
+    def leave(self, commits: Sequence[StoredCommit], numbers: Collection[int]) -> None:
+        """Leave those of these numbers for later: an object store keeps bytes that they need, and does not answer."""
+        for commit in commits:
+            if commit.number in numbers:
+                self.commits.add(commit.number)
+                self.of_robot[commit.id.author.robot] += 1
+                self.away_s = time.monotonic()
+
+    def error(self) -> CairnError | None:
+        """Error for which commits wait."""
+        if self.why is None and self.away_s is not None:
+            return AwayError("commits wait for cells or evidence in the object store, which does not answer")
+        return self.why
+
     def probe(self, store: FoldStore, row: MapRow, damaged: Damage) -> None:
         """Read the damaged cells again if it is time; if one is sound, everything that waits is tried again."""
+        if self.away_s is not None and time.monotonic() - self.away_s > AWAY_S:
+            self.away_s = None
+            self.commits.clear()
+            self.of_robot.clear()
         # The count is taken before the look: a cell healed during it makes the next call look again.
         healed = damaged.healed(row.name)
         if self.cells and (healed != self.healed or time.monotonic() - self.probed_s > PROBE_S):
@@ -120,13 +143,17 @@ def fold_around(
             continue
         # A cell found damaged only now joins the others, and the rest of the commits is tried without it.
         try:
-            return fold_commits(store, row, cache, ready, order=order)
+            outcome = fold_commits(store, row, cache, ready, order=order)
         except DamagedCellError as exc:
             if exc.key in waiting.cells:
                 raise
             log.error("map %s: what touches cell %s waits: %s", row.name, cell_of_key(exc.key), exc.message)
             waiting.add(exc)
             damaged.note(row.name, [exc.key])
+            continue
+        waiting.leave(ready, outcome.left)
+        if outcome.folded or not outcome.left:
+            return outcome.folded
     return 0
 
 
@@ -144,7 +171,7 @@ def _can_be_read(store: FoldStore, row: MapRow, key: CellKey) -> bool:
     try:
         with store.snapshot(row) as snapshot:
             cell_to_change(snapshot, key, row_of_cell(snapshot, key), row.geometry)
-    except DamagedCellError:
+    except (DamagedCellError, AwayError):
         return False
     return True
 
@@ -156,7 +183,7 @@ class Folded:
     commits: int
     """Count of the commits folded."""
     waits_for: CairnError | None
-    """Error of a damaged cell that other commits wait for; None: none waits."""
+    """Error of a damaged cell, or of an object store, that other commits wait for; None: none waits."""
     is_planning: bool = False
     """True while costly commits, of any map, are planned in the background: look again soon."""
 
@@ -187,7 +214,7 @@ class LocalFolding:
             CairnError: nothing was folded.
         """
         if not is_news and self._lanes.is_planning():
-            return Folded(0, self._waiting[row.name].why if row.name in self._waiting else None, is_planning=True)
+            return Folded(0, self._waiting[row.name].error() if row.name in self._waiting else None, is_planning=True)
         cache = self._cache_of(row)
         waiting = self._waiting.setdefault(row.name, Waiting())
         turns, start_s = self._turns.setdefault(row.name, FoldTurns()), time.monotonic()
@@ -200,7 +227,7 @@ class LocalFolding:
         turns.end_group(time.monotonic() - start_s)
         cache.trim()
         self._lanes.plan_next(row, turns)
-        return Folded(count, waiting.why, is_planning=self._lanes.has_plan())
+        return Folded(count, waiting.error(), is_planning=self._lanes.has_plan())
 
     def _cache_of(self, row: MapRow) -> CellCache:
         """Cells of a map that stay decoded from one group to the next: a robot's next scans touch the same ones.

@@ -11,10 +11,14 @@ from collections.abc import Callable, Iterable
 from cairn_map.errors import CairnError, DamagedDataError, UnreachableError
 from cairn_server.metrics import ServerFigures
 from cairn_server.settings import Settings
+from cairn_server.store.objects.cold_bytes import AwayError
 from cairn_server.store.store import StoreHealth
 
 KEEP_S = 1.0
 """Lifetime of an answer: any client may ask, and each look writes to the disk."""
+
+OF_ONE_MAP = DamagedDataError, AwayError
+"""Errors of folding for which some commits of a map wait, while all else goes on."""
 
 
 class FoldHealth:
@@ -49,16 +53,16 @@ class FoldHealth:
         """Count a jump of the wall clock, ahead or (negative) back; a server is ready all the same."""
         self._figures.clock_jumps.labels("ahead" if jump_s > 0 else "back").inc()
 
-    def damaged(self) -> frozenset[str]:
-        """Maps with commits that wait for a damaged cell to be healed: no fault of the server as a whole."""
+    def held_up(self) -> frozenset[str]:
+        """Maps with commits that wait for a damaged cell, or an object store: no fault of the server as a whole."""
         with self._lock:
-            return frozenset(name for name, error in self._failing.items() if isinstance(error, DamagedDataError))
+            return frozenset(name for name, error in self._failing.items() if isinstance(error, OF_ONE_MAP))
 
     def complaint(self) -> str | None:
-        """Reason why folding fails, damage aside; None if it does not fail."""
+        """Reason why folding fails, what is of one map aside; None if it does not fail."""
         with self._lock:
             for error in self._failing.values():
-                if not isinstance(error, DamagedDataError):
+                if not isinstance(error, OF_ONE_MAP):
                     return error.message if isinstance(error, CairnError) else type(error).__name__
         return None
 
@@ -124,6 +128,6 @@ class Readiness:
         return found
 
     def _lag(self) -> list[str]:
-        limit_s, damaged = self._settings.fold_lag_max_s, self._folds.damaged()
-        lag_s = max((b.waited_s for b in self._store.backlogs() if b.map not in damaged), default=0.0)
+        limit_s, held_up = self._settings.fold_lag_max_s, self._folds.held_up()
+        lag_s = max((b.waited_s for b in self._store.backlogs() if b.map not in held_up), default=0.0)
         return [f"fold_lag: a commit has waited for {lag_s:.0f} s (at most {limit_s:.0f})"] if lag_s > limit_s else []

@@ -12,7 +12,8 @@ the server does. The exit code is 0 if all is sound and 6 if not.
 
     $ cairn serve check --store postgresql://cairn@database/cairn
 
-A database is checked in the same way, while servers work on it; its own pages are its own server's (pg_amcheck).
+A database is checked in the same way, while servers work on it, with all that is in its object store (--objects); its
+own pages are its own server's (pg_amcheck).
 
 With --repair, which needs the server stopped, damaged cells are rebuilt where the log still has all of their commits.
 Others stay set aside: the server answers 500 damaged_store for such a cell alone and goes on with all others; commits
@@ -46,10 +47,11 @@ def main(argv: list[str]) -> int:
     )
     parser.add_argument("--data", type=Path, default=Settings().folder, metavar="DIR", help="folder of the store")
     parser.add_argument("--store", metavar="URL", help="check this PostgreSQL database instead of a folder")
+    parser.add_argument("--objects", metavar="URL", help="bucket with the cold bytes of this database (s3://...)")
     parser.add_argument("--repair", action="store_true", help="rebuild damaged cells; the server must be stopped")
     args = parser.parse_args(argv)
     if args.store is not None:
-        return _check_database(args.store, is_repair=args.repair)
+        return _check_database(args.store, args.objects, is_repair=args.repair)
     if args.repair:
         store = SqliteStore(args.data)
         try:
@@ -76,7 +78,7 @@ def main(argv: list[str]) -> int:
     return 0
 
 
-def _check_database(url: str, *, is_repair: bool) -> int:
+def _check_database(url: str, objects: str | None, *, is_repair: bool) -> int:
     if is_repair:
         raise BadInputError(
             "bad_setting",
@@ -84,9 +86,10 @@ def _check_database(url: str, *, is_repair: bool) -> int:
             "the next robot that has them, and sums come with a restored backup",
         )
     try:
-        open_store, _ = store_of(Settings(store=url))
+        open_store, _ = store_of(Settings(store=url, objects=objects))
     except ValidationError as exc:
-        raise BadInputError("bad_setting", f"--store: {first_error(exc)}") from exc
+        flag = "--objects" if "objects" in exc.errors()[0]["loc"] else "--store"
+        raise BadInputError("bad_setting", f"{flag}: {first_error(exc)}") from exc
     store = open_store()
     try:
         return _reported(check_all(store))

@@ -62,7 +62,7 @@ from cairn_server.http.routes.long_bodies import LongBodies, fork_long_bodies
 from cairn_server.operations import check as check_command
 from cairn_server.operations.backup import back_up_command, restore_command
 from cairn_server.operations.serve_options import serve_parser, settings_of
-from cairn_server.operations.store_opening import store_of
+from cairn_server.operations.store_opening import settling, store_of
 from cairn_server.operations.upstream import joined
 from cairn_server.service import Service
 from cairn_server.settings import LOOPBACK, Settings
@@ -104,7 +104,7 @@ def main(argv: list[str]) -> int:
     settings = settings_of(args)
     settings.check_reach()
     settings.check_tls()
-    settings.check_folding()
+    settings.check_store()
     settings = settings.model_copy(update={"limit_concurrency": connections_within(settings.limit_concurrency)})
     signal.signal(signal.SIGTERM, _stop)
     sys.setswitchinterval(SWITCH_S)
@@ -118,7 +118,7 @@ def main(argv: list[str]) -> int:
     with _folder_of(settings), listen(settings.host, settings.port) as listener:
         try:
             service = Service(open_store(), settings, fold_process=folding)
-            with closing(service), _views_of(service), joined(service):
+            with closing(service), _views_of(service), settling(service), joined(service):
                 _serve(service, listener, long_bodies)
         except KeyboardInterrupt:
             pass

@@ -40,6 +40,7 @@ WIDTH = 110
 FLAGS = {
     "folder": ("--data", "DIR"),
     "store": ("--store", "URL"),
+    "objects": ("--objects", "URL"),
     "host": ("--host", "ADDRESS"),
     "port": ("--port", "PORT"),
     "tls_cert": ("--tls-cert", "FILE"),

@@ -1,10 +1,13 @@
-"""Opening of the store that settings name: SQLite in a folder, or a PostgreSQL database."""
+"""Opening of the store that settings name: SQLite in a folder, or PostgreSQL with or without an object store behind."""
 
+import secrets
 from collections.abc import Callable
+from contextlib import AbstractContextManager, closing, nullcontext
 from functools import partial
 
 from cairn_map.errors import BadInputError
 from cairn_server.folding.folding import FoldReads
+from cairn_server.service import Service
 from cairn_server.settings import Settings
 from cairn_server.store.sqlite.readers import Readers
 from cairn_server.store.sqlite.reads import SqliteReads
@@ -13,13 +16,15 @@ from cairn_server.store.store import Store
 
 FOLD_CONNECTIONS = 4
 """Connections to the database of the process that plans folds: it has two threads."""
+SETTLE_CONNECTIONS = 2
+"""Those of the thread that moves bytes to the object store."""
 
 
 def store_of(settings: Settings) -> tuple[Callable[[], Store], Callable[[], FoldReads]]:
     """Function that opens the store, and one that opens what the process that folds reads of it.
 
     Raises:
-        BadInputError: kind `bad_setting`: the package for PostgreSQL is not installed.
+        BadInputError: kind `bad_setting`: the package for PostgreSQL, or for object stores, is not installed.
     """
     if settings.store is None:
         file = settings.folder / FILE_NAME
@@ -29,8 +34,48 @@ def store_of(settings: Settings) -> tuple[Callable[[], Store], Callable[[], Fold
         from cairn_server.store.postgres.reads import PgReads
         from cairn_server.store.postgres.store import PgStore
     except ImportError as exc:
-        raise BadInputError(
-            "bad_setting", "--store postgresql://... takes psycopg: pip install 'cairn-robotics[postgresql]'"
-        ) from exc
-    url = settings.store
-    return partial(PgStore, url), lambda: PgReads(Connections(url, limit=FOLD_CONNECTIONS))
+        raise _not_installed("--store postgresql://...", "psycopg", "postgresql") from exc
+    url, size_bytes_max = settings.store, settings.database_bytes_max
+    if settings.objects is None:
+        return (
+            partial(PgStore, url, size_bytes_max=size_bytes_max),
+            lambda: PgReads(Connections(url, limit=FOLD_CONNECTIONS)),
+        )
+    try:
+        from cairn_server.store.objects.bucket import open_bucket
+        from cairn_server.store.settling.binding import bind
+    except ImportError as exc:
+        raise _not_installed("--objects s3://...", "obstore", "objects") from exc
+    place = settings.objects
+
+    # A bucket has threads: each process opens its own, after it was forked.
+    def open_store() -> Store:
+        bucket = open_bucket(place)
+        store = PgStore(url, objects=bucket, size_bytes_max=size_bytes_max)
+        try:
+            with closing(Connections(url, limit=1)) as connections:
+                bind(connections, bucket, place)
+        except BaseException:
+            store.close()
+            raise
+        return store
+
+    return open_store, lambda: PgReads(Connections(url, limit=FOLD_CONNECTIONS), open_bucket(place))
+
+
+def settling(service: Service) -> AbstractContextManager[object]:
+    """Move bytes at rest to the object store for the length of a `with`, where this server is to do so."""
+    settings = service.settings
+    if settings.store is None or settings.objects is None or settings.folding == "elsewhere":
+        return nullcontext()
+    from cairn_server.operations.settle_thread import SettleThread
+    from cairn_server.store.objects.bucket import open_bucket
+    from cairn_server.store.postgres.connections import Connections
+    from cairn_server.store.settling.settler import Settler
+
+    connections = Connections(settings.store, limit=SETTLE_CONNECTIONS)
+    return SettleThread(service, Settler(connections, open_bucket(settings.objects), holder=secrets.token_hex(8)))
+
+
+def _not_installed(flag: str, package: str, extra: str) -> BadInputError:
+    return BadInputError("bad_setting", f"{flag} takes {package}: pip install 'cairn-robotics[{extra}]'")

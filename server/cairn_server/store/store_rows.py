@@ -164,6 +164,8 @@ class Fold:
     """Numbers of commits to set aside, and why: pushed again, they are pending again."""
     steps: tuple[RetractStep, ...] = ()
     """Progress of retracts that do not end with the fold in which they began."""
+    left: tuple[int, ...] = ()
+    """Numbers of commits that stay pending, since an object store keeps bytes that they need and does not answer."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

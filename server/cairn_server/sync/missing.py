@@ -32,6 +32,7 @@ from cairn_server.folding.cells_at_rest import DamagedCellError, sound_cell
 from cairn_server.folding.damaged_cells import as_named
 from cairn_server.folding.read_cache import ReadCache
 from cairn_server.store.history import folded_ids, is_proven
+from cairn_server.store.objects.cold_bytes import AwayError
 from cairn_server.store.store import Snapshot
 from cairn_server.store.store_rows import CellRow
 from cairn_server.store.tiles import is_in_box
@@ -198,6 +199,18 @@ class CellFrames:
         # The asker's state of the cell is the present one.
         if start is not None and row.lm <= start.seq:
             return None
+        try:
+            return self._bytes_of(row, start)
+        except AwayError as exc:
+            log.warning("cell %s is sent without its bytes: %s", cell_of_key(row.key), exc.message)
+            return self._frame(FrameKind.FULL, row.key, start, row.fingerprint)
+
+    def _bytes_of(self, row: CellRow, start: Cursor | None) -> CellFrame:
+        """Smallest frame with bytes.
+
+        Raises:
+            AwayError: they are in the object store, which does not answer.
+        """
         # Delta or changed blocks, where one is smaller than the whole cell.
         if start is not None:
             query = self.query

@@ -50,7 +50,7 @@ def test_other_maps_are_served_and_folded(live: Live) -> None:
     assert live.http.get(cell_path(row, SOUND)).status_code == 200
     assert live.http.get("/readyz").status_code == 200
     assert live.pending(row) == 1
-    until(lambda: live.service.readiness._folds.damaged() == {row.name}, "the fold of the damaged map failed")
+    until(lambda: live.service.readiness._folds.held_up() == {row.name}, "the fold of the damaged map failed")
 
 
 def body_of(key: CellKey) -> bytes:
@@ -62,7 +62,7 @@ def test_whoever_still_has_a_damaged_cell_heals_it_and_folding_goes_on(live: Liv
     row = broken_map(live, keep_diffs=False)
     live.service._fold_thread._local._caches.clear()
     live.push(row, pushed(1, 0))
-    until(lambda: live.service.readiness._folds.damaged() >= {row.name}, "the fold of the damaged map failed")
+    until(lambda: live.service.readiness._folds.held_up() >= {row.name}, "the fold of the damaged map failed")
     wrong = live.http.put(cell_path(row, BROKEN), content=pushed(0, 0, scans=7).cells[SOUND])
     assert (wrong.status_code, kind_of(wrong)) == (400, "bad_cell")
     other = live.http.put(cell_path(row, BROKEN), content=pushed(5, 2).cells[BROKEN])

@@ -168,7 +168,7 @@ def test_a_plan_is_written_behind_what_came_meanwhile_with_the_stamps_of_its_own
     folder = Folder(store, [costly(0, dust(WIDE))])
     assert folder.look() == 0  # its plan begins at the empty map
     folder.push([scan(0), scan(1)])
-    assert fold_commits(store, folder.row, CellCache(WIDE), folder.waiting_of(WREN)) == 2
+    assert fold_commits(store, folder.row, CellCache(WIDE), folder.waiting_of(WREN)).folded == 2
     assert folder.look() == 1
     with store.snapshot(folder.row) as snapshot:
         cell = snapshot.cell(HERE)
@@ -182,7 +182,7 @@ def test_a_plan_whose_cells_changed_is_thrown_away_and_made_again(store: Store) 
     assert folder.look() == 0
     folder.folding.close()
     folder.push([scan(0, HERE)])
-    assert fold_commits(store, folder.row, CellCache(WIDE), folder.waiting_of(WREN)) == 1  # by another folding
+    assert fold_commits(store, folder.row, CellCache(WIDE), folder.waiting_of(WREN)).folded == 1  # by another folding
     assert folder.look() == 0
     folder.finish()
     assert cells_of(store, folder.row) == straight([costly(0, air(WIDE)), scan(0, HERE)])
@@ -227,8 +227,8 @@ def test_what_another_folding_wrote_first_is_not_audited_twice(monkeypatch: pyte
     (bad,) = store.pending(row, limit=9, size_bytes_max=1 << 26)
     bad = replace(bad, sha=bytes(32))
     monkeypatch.setattr(store, "fold", refused)
-    assert fold_commits(store, row, CellCache(WIDE), [bad]) == 0
+    assert fold_commits(store, row, CellCache(WIDE), [bad]).folded == 0
     assert not lines
     monkeypatch.setattr(store, "fold", write)
-    assert fold_commits(store, row, CellCache(WIDE), [bad]) == 1
+    assert fold_commits(store, row, CellCache(WIDE), [bad]).folded == 1
     assert lines == ["damaged_commit"]

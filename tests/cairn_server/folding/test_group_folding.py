@@ -80,12 +80,12 @@ def test_commits_elsewhere_are_folded_and_those_in_the_damaged_cell_wait_until_i
     elsewhere = sum_of([*BASE, *(commit for commit in commits if not touches(commit))])
     assert read({KEYS[2]: live.http.get(cell_path(row, KEYS[2])).content}) == {KEYS[2]: elsewhere[KEYS[2]]}
     assert live.http.get(cell_path(row, BROKEN)).status_code == 500
-    assert live.service.readiness._folds.damaged() == {row.name}
+    assert live.service.readiness._folds.held_up() == {row.name}
     damage(live, "UPDATE commits SET received_age_s = -1e9 WHERE folded_seq IS NULL")
     assert live.http.get("/readyz").status_code == 200  # however long they wait
     heal(live, row, whole)
     assert live.cells(row) == cells_of_a_sound_map(live, [*BASE, *commits])
-    until(lambda: live.service.readiness._folds.damaged() == frozenset(), "the map is well")
+    until(lambda: live.service.readiness._folds.held_up() == frozenset(), "the map is well")
 
 
 def test_a_retract_of_what_is_in_the_damaged_cell_waits_and_one_of_what_waits_does_not(live: Live) -> None:
@@ -189,7 +189,7 @@ def test_a_cell_that_the_log_tells_again_is_found_out_without_a_word(
 ) -> None:
     row, _ = broken_map(live)
     live.push(row, pushed(1, 0))
-    until(lambda: live.service.readiness._folds.damaged() == {row.name}, "the cell is found damaged")
+    until(lambda: live.service.readiness._folds.held_up() == {row.name}, "the cell is found damaged")
     damage(live, "UPDATE diff SET body = ? WHERE cell = ? AND body IS NULL", FIRST.cells[BROKEN], BROKEN)
     live.push(row, pushed(2, 1))
     until(lambda: len(ids_pending(live, row)) == 1, "what is elsewhere is folded")

@@ -77,7 +77,7 @@ def test_a_map_with_a_damaged_cell_does_not_take_the_server_away_from_the_others
     row = live.new_map()
     monkeypatch.setattr(group_folding, "fold_around", raising(DamagedDataError("damaged_store", "one cell")))
     live.push(row, pushed(0, 0))
-    until(lambda: row.name in live.service.readiness._folds.damaged(), "the fold failed")
+    until(lambda: row.name in live.service.readiness._folds.held_up(), "the fold failed")
     store_of(live)._writer.run(lambda c: c.execute("UPDATE commits SET received_age_s = -1e9").fetchall())
     assert reasons(live) == ""
 

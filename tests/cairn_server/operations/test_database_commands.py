@@ -1,53 +1,20 @@
 """`cairn serve --store` and `serve check --store` over a real database: roles, refusals, and findings."""
 
-import signal
-from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
 import pytest
-from tests.fixtures.map.made import SMALL
+from tests.fixtures.server.database_servers import ended, folded, push, served
 from tests.fixtures.server.live import Process, until
 from tests.fixtures.server.postgres import Database
 from tests.fixtures.server.pushes import pushed
 
 from cairn_map.errors import BadInputError, DamagedDataError
-from cairn_map.wire.messages import CreateMap, MapInfo
 from cairn_server.operations.serve import main
 
+__all__ = ["ended"]
 pytestmark = [pytest.mark.processes, pytest.mark.slow]
 COMMITS = [pushed(n, n) for n in range(3)]
-
-
-@pytest.fixture
-def ended() -> Iterator[list[Process]]:
-    """Processes to be ended with the test."""
-    found: list[Process] = []
-    yield found
-    for process in found:
-        process.send(signal.SIGTERM)
-        assert process.end()[0] == 0
-
-
-def served(folder: Path, database: Database, ended: list[Process], *options: str) -> str:
-    """URL of a server over the database."""
-    process = Process(folder, "--store", database.url, *options)
-    ended.append(process)
-    assert process.url
-    return process.url
-
-
-def push(url: str, *commits: object) -> None:
-    json = {"Content-Type": "application/json"}
-    httpx.put(f"{url}/maps/lab", content=CreateMap(geometry=SMALL).model_dump_json(), headers=json).raise_for_status()
-    for commit in commits:
-        httpx.put(f"{url}/maps/lab/commits/{commit.id}", content=commit.data).raise_for_status()  # type: ignore[attr-defined]
-
-
-def folded(url: str, count: int) -> bool:
-    """True if the map has so many log entries."""
-    info = MapInfo.model_validate_json(httpx.get(f"{url}/maps/lab").raise_for_status().content)
-    return int(info.cursor.split(".")[1]) == count
 
 
 def test_one_server_folds_in_a_process_of_its_own_and_the_check_reads_all(

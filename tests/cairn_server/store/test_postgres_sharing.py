@@ -11,7 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from tests.fixtures.map.made import SMALL
-from tests.fixtures.server.commit_contract import bodies, new_map
+from tests.fixtures.server.commit_contract import bodies, folded_map, new_map
 from tests.fixtures.server.crowd_contract import all_at_once
 from tests.fixtures.server.live import until
 from tests.fixtures.server.postgres import Database, PostgresServer, new_database
@@ -357,3 +357,14 @@ def test_where_notices_do_not_come_back_listening_is_tried_seldom_and_said_once(
     assert heard == [] and pauses[:4] == [0.02, 0.04, 0.08, 0.16]
     assert pauses[-1] == postgres_notes.SILENT_PAUSE_S
     assert sum("pooler" in record.getMessage() for record in caplog.records) == 1
+
+
+# Numbers
+
+
+def test_a_new_map_in_a_database_of_very_many_commits_is_folded(store: PgStore, postgres_database: Database) -> None:
+    # In one statement stand lists of small numbers (entries of the log) and of large ones (commits).
+    postgres_database.execute("ALTER TABLE commits ALTER number RESTART WITH 5000000000")
+    commits = [pushed(0, 0), pushed(1, 1)]
+    row = folded_map(store, *commits)
+    assert read(bodies(store, row)) == sum_of(commits)

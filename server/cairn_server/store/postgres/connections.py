@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 import psycopg
 from psycopg import conninfo, errors
 from psycopg.pq import TransactionStatus
-from psycopg.types.numeric import Int8BinaryDumper
+from psycopg.types.numeric import Int8BinaryDumper, Int8Dumper
 
 from cairn_map.errors import UnreachableError
 from cairn_server.store.postgres.failures import AGAIN, failure_of
@@ -81,7 +81,9 @@ def connect_to_any(url: str, settings: str = "", **options: str) -> Connection:
     except BaseException:
         made.close()
         raise
-    # One width for all integers: else a statement is parsed again for each mix of widths of its values.
+    # One width for all integers: else a statement is parsed again for each mix of widths of its values, and of several
+    # lists in it all would have the width that the first one needs.
+    made.adapters.register_dumper(int, Int8Dumper)
     made.adapters.register_dumper(int, Int8BinaryDumper)
     return made
 

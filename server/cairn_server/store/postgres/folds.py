@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from cairn_map.commits.cursor import ENTRY_FOLD, next_chain
 from cairn_map.commits.ids import Author, CommitId
 from cairn_server.store.history import KnownVectors, crosses_mark
+from cairn_server.store.objects.cold_bytes import NoObjects
 from cairn_server.store.postgres.connections import Connection, Connections, first, rows
 from cairn_server.store.postgres.shares import give_back_sums, lock_head
 from cairn_server.store.postgres.snapshot import PgSnapshot
@@ -31,7 +32,11 @@ PUT_CELLS = """
     ) AS u
     ON CONFLICT (map, layer, cell) DO UPDATE SET lm = excluded.lm, digest = excluded.digest,
         fingerprint = excluded.fingerprint, voxels = excluded.voxels, size_bytes = excluded.size_bytes,
-        hottest_k = excluded.hottest_k, body = excluded.body, stamps = excluded.stamps"""
+        hottest_k = excluded.hottest_k, body = excluded.body, stamps = excluded.stamps, object = NULL"""
+LEAVE_OBJECTS = """
+    INSERT INTO dead_object (map, name, since_age_s)
+    SELECT map, object, %s FROM cell WHERE map = %s AND layer = 0 AND cell = ANY(%s) AND object IS NOT NULL"""
+"""SQL that notes the objects of cells that are about to be written here, so that they are deleted in time."""
 
 CLAIM = """
 WITH wanted AS (SELECT * FROM unnest(%(maps)s::bigint[]) WITH ORDINALITY AS w (map, turn)),
@@ -67,31 +72,34 @@ def write_fold(connection: Connection, row: MapRow, fold: Fold, *, age_s: float)
     tiles = PgTileWriter(connection, row.number)
     for batch in _batches(fold):
         tiles.note(batch)
-        _put_cells(connection, row, batch)
+        _put_cells(connection, row, batch, age_s=age_s)
     tiles.write(folded=sum(entry.kind == ENTRY_FOLD for entry in fold.entries))
     query = "UPDATE head SET seq = %s, chain = %s WHERE map = %s"
     connection.execute(query, (fold.head.seq, fold.head.chain, row.number))
     if crosses_mark(fold.base, fold.head):
-        snapshot = PgSnapshot(connection, row.number, row.geometry.digest(), KnownVectors())
+        snapshot = PgSnapshot(connection, row.number, row.geometry.digest(), KnownVectors(), NoObjects())
         snapshot.keep_mark(fold.head.seq)
     if fold.entries:
         connection.execute("SELECT pg_notify(%s, %s)", (CHANNEL, f"{row.number} {fold.head.seq}"))
     return True
 
 
-def heal_cell(connection: Connection, row: MapRow, cell: CellRow) -> bool:
-    """Put sound bytes in the place of a damaged cell; False if it changed meanwhile."""
+def heal_cell(connection: Connection, row: MapRow, cell: CellRow, *, age_s: float) -> bool:
+    """Put sound bytes in the place of a damaged cell at an age of the store; False if it changed meanwhile."""
     lock_head(connection, row)
-    changed = connection.execute(
-        "UPDATE cell SET digest = %s, fingerprint = %s, voxels = %s, size_bytes = %s, body = %s, hottest_k = %s"
-        " WHERE map = %s AND layer = 0 AND cell = %s AND lm = %s",
+    is_same = "SELECT 1 FROM cell WHERE map = %s AND layer = 0 AND cell = %s AND lm = %s"
+    if first(connection, is_same, (row.number, cell.key, cell.lm)) is None:
+        return False
+    connection.execute(LEAVE_OBJECTS, (age_s, row.number, [int(cell.key)]))
+    # Stamps that are lost with an object count as if all of the cell had changed with its last entry.
+    connection.execute(
+        "UPDATE cell SET digest = %s, fingerprint = %s, voxels = %s, size_bytes = %s, body = %s, hottest_k = %s,"
+        " stamps = coalesce(stamps, %s), object = NULL WHERE map = %s AND layer = 0 AND cell = %s",
         (
             *(cell.digest, cell.fingerprint.to_bytes(), cell.voxels, cell.size_bytes, cell.body, cell.hottest_k),
-            *(row.number, cell.key, cell.lm),
+            *(cell.stamps, row.number, cell.key),
         ),
     )
-    if not changed.rowcount:
-        return False
     recount_tile(connection, row.number, tile_of(cell.key))
     return True
 
@@ -158,7 +166,8 @@ def _write_entries(connection: Connection, row: MapRow, fold: Fold, age_s: float
     of_entries = "unnest(%(seqs)s::bigint[], %(kinds)s::bytea[], %(numbers)s::bigint[]) AS e (seq, kind, number)"
     connection.execute(
         "INSERT INTO touched (map, layer, cell, seq, kind, robot, incarnation, n, size_bytes)"
-        " SELECT d.map, d.layer, d.cell, e.seq, e.kind, c.robot, c.incarnation, c.n, octet_length(d.body)"
+        " SELECT d.map, d.layer, d.cell, e.seq, e.kind, c.robot, c.incarnation, c.n,"
+        " coalesce(octet_length(d.body), d.size_bytes)"
         f" FROM {of_entries} JOIN commits AS c ON c.map = %(map)s AND c.number = e.number"
         " JOIN diff AS d ON d.map = c.map AND d.commit_number = c.number",
         values,
@@ -208,7 +217,8 @@ def _batches(fold: Fold) -> Iterator[list[CellRow]]:
         yield batch
 
 
-def _put_cells(connection: Connection, row: MapRow, cells: list[CellRow]) -> None:
+def _put_cells(connection: Connection, row: MapRow, cells: list[CellRow], *, age_s: float) -> None:
+    connection.execute(LEAVE_OBJECTS, (age_s, row.number, [int(cell.key) for cell in cells]))
     columns = (
         (int(c.key), c.lm, c.digest, c.fingerprint.to_bytes(), c.voxels, c.size_bytes, c.hottest_k, c.body, c.stamps)
         for c in cells

@@ -1,12 +1,19 @@
 """State of a store in PostgreSQL, for administrators and probes, and robots' use of their quotas."""
 
+import logging
+import math
+import time
 from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import NamedTuple
 
 from psycopg import errors
 
 from cairn_map.errors import UnreachableError
+from cairn_server.store.objects.cold_bytes import ColdReads, split_cell_object
 from cairn_server.store.postgres.connections import Connection, Connections, first, rows
+from cairn_server.store.postgres.failures import RETRY_FULL_S
 from cairn_server.store.postgres.folds import heal_cell
 from cairn_server.store.postgres.schema import IS_WAITING
 from cairn_server.store.postgres.writing_threads import WritingThreads
@@ -17,6 +24,20 @@ PROBE_S = 5
 """Time in which the database writes a probe, unless it does not keep up."""
 MAPS_MAX = 1000
 """Most maps whose backlogs are listed."""
+SIZE = "SELECT pg_database_size(current_database())"
+SIZE_EVERY_S = 5.0
+"""Time between two looks at the database's size: pushes ask for it."""
+ALARM_SHARE, FULL_SHARE = 0.7, 0.95
+"""Shares of the room set for the database from which on a line is logged, and pushes are refused."""
+
+log = logging.getLogger(__name__)
+
+
+class _Size(NamedTuple):
+    """Size of the database at an instant."""
+
+    size_bytes: int
+    at_s: float
 
 
 class PgUses:
@@ -43,10 +64,24 @@ class PgUses:
 class PgHealth:
     """`store.StoreHealth`."""
 
-    def __init__(self, connections: Connections, threads: WritingThreads, age: StoreAge) -> None:
+    def __init__(
+        self,
+        connections: Connections,
+        threads: WritingThreads,
+        age: StoreAge,
+        *,
+        objects: ColdReads,
+        size_bytes_max: int | None,
+        steady_s: Callable[[], float] = time.monotonic,
+    ) -> None:
         self._connections = connections
         self._threads = threads
         self._age = age
+        self._objects = objects
+        self._size_bytes_max = size_bytes_max
+        self._steady_s = steady_s
+        self._size = _Size(0, -math.inf)
+        self._is_alarmed = False
 
     def backlogs(self) -> list[Backlog]:
         """Commits that are not folded yet, or whose retract is under way, of the maps that have any."""
@@ -64,11 +99,11 @@ class PgHealth:
     def figures(self) -> StoreFigures:
         """Sizes and counts."""
         with self._connections.lent() as connection:
-            size_bytes = first(connection, "SELECT pg_database_size(current_database())")
+            size_bytes = first(connection, SIZE)
         return StoreFigures(
             size_bytes=size_bytes,
             ahead_bytes=0,
-            free_bytes=None,
+            free_bytes=None if self._size_bytes_max is None else max(0, self._size_bytes_max - size_bytes),
             queued=self._threads.queued,
             written=self._connections.written,
             emptied=0,
@@ -76,11 +111,39 @@ class PgHealth:
         )
 
     def check_space(self, free_bytes_min: int) -> None:
-        """Nothing: the disk is the database's, which says itself when it is full (`disk_full`)."""
+        """Refuse pushes once the room that was set for the database is nearly full.
+
+        The disk is the database's, which says when it is full only once nothing can be written, folds neither. So
+        without that room nothing is refused here.
+
+        Raises:
+            UnreachableError: kind `disk_full`.
+        """
+        room = self._size_bytes_max
+        if room is None:
+            return
+        if self._steady_s() - self._size.at_s > SIZE_EVERY_S:
+            with self._connections.lent() as connection:
+                self._size = _Size(first(connection, SIZE), self._steady_s())
+        used, text = self._size.size_bytes, f"{self._size.size_bytes >> 20} of {room >> 20} MB"
+        is_alarmed = used > ALARM_SHARE * room
+        if is_alarmed and not self._is_alarmed:
+            log.warning("the database has %s: give it room, or move evidence out of it (docs/scale.md)", text)
+        self._is_alarmed = is_alarmed
+        if used > FULL_SHARE * room or room - used < free_bytes_min:
+            raise UnreachableError("disk_full", f"the database has {text}", retry_after_s=RETRY_FULL_S)
 
     def heal(self, row: MapRow, cell: CellRow) -> bool:
         """Put sound bytes in the place of a damaged cell; False if it changed meanwhile."""
-        return self._connections.run(lambda connection: heal_cell(connection, row, cell))
+        sound = replace(cell, stamps=self._cold_stamps(row, cell))
+        return self._connections.run(lambda connection: heal_cell(connection, row, sound, age_s=self._age.now_s()))
+
+    def _cold_stamps(self, row: MapRow, cell: CellRow) -> bytes:
+        """Stamps of a cell that are in the object store; empty if they are not, or are lost with the cell's bytes."""
+        query = "SELECT object FROM cell WHERE map = %s AND layer = 0 AND cell = %s AND lm = %s"
+        with self._connections.lent() as connection:
+            name = first(connection, query, (row.number, cell.key, cell.lm))
+        return b"" if name is None else split_cell_object(self._objects.get(name))[1]
 
     def probe(self) -> None:
         """Write something that changes nothing, as durably as a commit."""

@@ -10,6 +10,7 @@ from cairn_map.commits.ids import Author, CommitId
 from cairn_map.evidence.grid import CellKey, Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.store.history import KnownVectors
+from cairn_server.store.objects.cold_bytes import ColdReads, NoObjects
 from cairn_server.store.postgres.connections import Connection, Connections, first, rows
 from cairn_server.store.postgres.retention import is_retracted
 from cairn_server.store.postgres.schema import IS_WAITING
@@ -21,8 +22,10 @@ from cairn_server.store.stored_columns import ids_from_text
 class PgReads:
     """The reading half of `store.Store`."""
 
-    def __init__(self, connections: Connections) -> None:
+    def __init__(self, connections: Connections, objects: ColdReads | None = None) -> None:
+        """Read a database, and what moved from it to an object store."""
         self._connections = connections
+        self._objects = objects or NoObjects()
         self._vectors = KnownVectors()
         self._maps: dict[int, MapRow] = {}
 
@@ -83,7 +86,7 @@ class PgReads:
                 if numbers and total_bytes > size_bytes_max:
                     break
                 numbers.append(number)
-            return _commits(connection, row, numbers)
+            return _commits(connection, row, numbers, self._objects)
 
     def commit(self, row: MapRow, commit: CommitId) -> StoredCommit | None:
         """A commit with its diff, folded or not; None if there is none."""
@@ -102,7 +105,7 @@ class PgReads:
     def snapshot(self, row: MapRow) -> Iterator[PgSnapshot]:
         """One state of the map."""
         with self._connections.snapshot() as connection:
-            yield PgSnapshot(connection, row.number, row.geometry.digest(), self._vectors)
+            yield PgSnapshot(connection, row.number, row.geometry.digest(), self._vectors, self._objects)
 
     def map_rows(self, clause: str, values: tuple[Any, ...]) -> list[MapRow]:
         """Maps that fit a clause of ours."""
@@ -130,23 +133,29 @@ class PgReads:
         with self._connections.snapshot() as connection:
             query = f"SELECT number FROM commits WHERE {clause}"
             number = first(connection, query, (row.number, *commit.author, commit.n))
-            return None if number is None else _commits(connection, row, [number])[0]
+            return None if number is None else _commits(connection, row, [number], self._objects)[0]
 
 
-def _commits(connection: Connection, row: MapRow, numbers: list[int]) -> list[StoredCommit]:
-    """Commits of these numbers, in this order, with their diffs."""
+def _commits(connection: Connection, row: MapRow, numbers: list[int], objects: ColdReads) -> list[StoredCommit]:
+    """Commits of these numbers, in this order, with their diffs.
+
+    Raises:
+        AwayError: a diff is in the object store, which does not answer.
+    """
     if not numbers:
         return []
     bodies: defaultdict[int, dict[CellKey, bytes]] = defaultdict(dict)
     query = (
-        "SELECT commit_number, cell, body FROM diff WHERE map = %s AND layer = 0 AND commit_number = ANY(%s)"
-        " ORDER BY cell"
+        "SELECT commit_number, cell, body, segment, start_bytes, size_bytes FROM diff"
+        " WHERE map = %s AND layer = 0 AND commit_number = ANY(%s) ORDER BY cell"
     )
-    for number, cell, body in rows(connection, query, (row.number, numbers)):
-        bodies[number][CellKey(cell)] = body
+    found = rows(connection, query, (row.number, numbers))
+    cold = _cold_bodies([each[3:] for each in found if each[3] is not None], objects)
+    for number, cell, body, name, start, _ in found:
+        bodies[number][CellKey(cell)] = body if name is None else cold[name, start]
     columns = "number, robot, incarnation, n, sha, meta, retracts, gone, due_from, signatures"
     query = f"SELECT {columns} FROM commits WHERE map = %s AND number = ANY(%s)"
-    found = {
+    known = {
         number: StoredCommit(
             number=number,
             id=CommitId(Author(*author), n),
@@ -162,4 +171,20 @@ def _commits(connection: Connection, row: MapRow, numbers: list[int]) -> list[St
             connection, query, (row.number, numbers)
         )
     }
-    return [found[number] for number in numbers]
+    return [known[number] for number in numbers]
+
+
+def _cold_bodies(pieces: list[tuple[str, int, int]], objects: ColdReads) -> dict[tuple[str, int], bytes]:
+    """Bytes of pieces of segments (name, start, size), by name and start: one read for each segment.
+
+    Pieces of one commit lie side by side. Those of a segment that is lost are empty, as damaged as it is.
+    """
+    bodies: dict[tuple[str, int], bytes] = {}
+    spans: defaultdict[str, list[tuple[int, int]]] = defaultdict(list)
+    for name, start, size_bytes in pieces:
+        spans[name].append((start, start + size_bytes))
+    for name, ends in spans.items():
+        first_byte, last = min(start for start, _ in ends), max(end for _, end in ends)
+        data = objects.part(name, start=first_byte, size_bytes=last - first_byte) or b""
+        bodies |= {(name, start): data[start - first_byte : end - first_byte] for start, end in ends}
+    return bodies

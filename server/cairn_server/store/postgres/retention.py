@@ -10,6 +10,21 @@ from cairn_server.store.postgres.schema import IS_WAITING, NOW_S
 from cairn_server.store.postgres.shares import lock_head
 from cairn_server.store.store_rows import MapRow, NewCommit
 
+DROP_DIFFS = """
+WITH went AS (
+    DELETE FROM diff WHERE map = %(map)s AND commit_number = ANY(%(numbers)s) RETURNING segment
+), fewer AS (
+    SELECT segment AS name, count(*) AS pieces FROM went WHERE segment IS NOT NULL GROUP BY segment
+), empty AS (
+    DELETE FROM segment USING fewer
+    WHERE map = %(map)s AND segment.name = fewer.name AND live = pieces RETURNING segment.name
+), left_over AS (
+    UPDATE segment SET live = live - pieces FROM fewer
+    WHERE map = %(map)s AND segment.name = fewer.name AND live > pieces
+)
+INSERT INTO dead_object (map, name, since_age_s) SELECT %(map)s, name, %(age_s)s FROM empty"""
+"""SQL that drops the evidence of commits, and gives up the segments of which nothing is left."""
+
 
 def forget_evidence(connection: Connection, row: MapRow, before_s: float, limit: int, *, age_s: float) -> int:
     """Drop the evidence of commits folded, and last pushed, before an age of the store (now `age_s`); their count.
@@ -45,7 +60,7 @@ def forget_evidence(connection: Connection, row: MapRow, before_s: float, limit:
         " AND touched.seq IN (commits.folded_seq, commits.unfolded_seq)",
         values,
     )
-    connection.execute("DELETE FROM diff WHERE map = %(map)s AND commit_number = ANY(%(numbers)s)", values)
+    connection.execute(DROP_DIFFS, {**values, "age_s": age_s})
     query = "UPDATE commits SET gone = true, meta = '' WHERE map = %(map)s AND number = ANY(%(numbers)s)"
     connection.execute(query, values)
     return len(gone)

@@ -301,6 +301,44 @@ CREATE UNLOGGED TABLE server (                      -- those alive, each heard o
 ) WITH (fillfactor = 50);
 """
 
+OBJECTS = """
+-- Bytes that moved to an object store; NULL: they are here.
+ALTER TABLE cell ALTER body DROP NOT NULL, ALTER stamps DROP NOT NULL, ADD COLUMN object text;
+ALTER TABLE diff ALTER body DROP NOT NULL, ADD COLUMN segment text, ADD COLUMN start_bytes bigint,
+    ADD COLUMN size_bytes bigint;
+CREATE TABLE segment (
+    map bigint,
+    name text COLLATE "C",
+    live bigint NOT NULL,                           -- pieces that rows of diff name
+    size_bytes bigint NOT NULL,
+    PRIMARY KEY (map, name)
+);
+-- Every object that no row names: on its way there, or out of use. It is here before it is made, until it is deleted.
+CREATE TABLE dead_object (
+    map bigint,
+    name text COLLATE "C",
+    since_age_s float8 NOT NULL,                    -- age of the store
+    doomed boolean NOT NULL DEFAULT false,          -- is being deleted, so that no row may name it any more
+    PRIMARY KEY (map, name)
+);
+CREATE INDEX dead_object_since ON dead_object (since_age_s);
+CREATE TABLE settled (                              -- what was looked at; what came later is not here any more, or hot
+    map bigint PRIMARY KEY,
+    seq bigint NOT NULL DEFAULT 0,                  -- tiles changed up to here
+    age_s float8 NOT NULL DEFAULT 0,                -- commits folded up to here,
+    number bigint NOT NULL DEFAULT 0                -- and this one
+);
+CREATE TABLE object_store (
+    one boolean PRIMARY KEY CHECK (one),
+    id text NOT NULL,                               -- as the object that marks its place says, too
+    url text NOT NULL,
+    holder text,                                    -- process that settles, until then
+    until timestamptz NOT NULL DEFAULT '-infinity'
+);
+"""
+BOUND_OLDEST = 4
+"""Oldest step whose programs read a store of which bytes are in an object store."""
+
 
 @dataclass(frozen=True, slots=True)
 class Step:
@@ -311,15 +349,19 @@ class Step:
     """Number of the oldest step whose programs work on a database that took this one."""
 
 
-STEPS = (Step(FIRST, oldest=1), Step(REPLICAS, oldest=1), Step(SERVERS, oldest=1))
+STEPS = (Step(FIRST, oldest=1), Step(REPLICAS, oldest=1), Step(SERVERS, oldest=1), Step(OBJECTS, oldest=1))
 
 
-def prepare(url: str) -> None:
+def prepare(url: str, *, has_objects: bool = False) -> None:
     """Make the tables in an empty database, or what an older store lacks of them; all in one transaction.
 
+    Args:
+        url: of the database.
+        has_objects: an object store is at hand.
+
     Raises:
-        BadInputError: kind `bad_store`: it cannot be reached, is none, or not fit for a store; `store_version`: the
-            store is of a newer cairn.
+        BadInputError: kind `bad_store`: it cannot be reached, is none, not fit for a store, or lacks the object store
+            in which some of its bytes are; `store_version`: the store is of a newer cairn.
     """
     try:
         stated = conninfo_to_dict(url)
@@ -336,6 +378,8 @@ def prepare(url: str) -> None:
             with _connected(url) as connection, connection.transaction():
                 _check_server(connection, place)
                 _take_steps(connection)
+                if not has_objects:
+                    _check_unbound(connection, place)
             return
         except (errors.UniqueViolation, errors.DuplicateTable) as exc:
             # Two servers make the first table at the same time: one of them fails, and finds it then.
@@ -387,6 +431,13 @@ def _check_server(connection: Connection, place: str) -> None:
         raise BadInputError("bad_store", f"cannot keep a store at {place}: {complaint}")
 
 
+def _check_unbound(connection: Connection, place: str) -> None:
+    has_table = first(connection, "SELECT to_regclass('object_store') IS NOT NULL")
+    bound = first(connection, "SELECT url FROM object_store") if has_table else None
+    if bound is not None:
+        raise BadInputError("bad_store", f"some bytes of {place} are in an object store: start with --objects {bound}")
+
+
 def _take_steps(connection: Connection) -> None:
     connection.execute("CREATE TABLE IF NOT EXISTS cairn_schema (version bigint NOT NULL, oldest bigint NOT NULL)")
     # Servers that start at once come one after the other from here on.
@@ -403,5 +454,5 @@ def _take_steps(connection: Connection) -> None:
     for step in STEPS[version:]:
         connection.execute(step.sql.encode())
     connection.execute("DELETE FROM cairn_schema")
-    newest = max(step.oldest for step in STEPS)
+    newest = max(oldest, *(step.oldest for step in STEPS))
     connection.execute("INSERT INTO cairn_schema VALUES (%s, %s)", (len(STEPS), newest))

@@ -14,6 +14,7 @@ from cairn_map.evidence.fingerprint import Fingerprint
 from cairn_map.evidence.grid import CellKey
 from cairn_map.wire.messages import LogEntry
 from cairn_server.store.history import KnownVectors
+from cairn_server.store.objects.cold_bytes import ColdReads, split_cell_object
 from cairn_server.store.postgres.connections import Connection, first, rows
 from cairn_server.store.postgres.failures import lost_map
 from cairn_server.store.postgres.schema import IS_MEASURED
@@ -47,8 +48,16 @@ LOG_PAGE = 64
 class PgSnapshot:
     """`store.Snapshot` over one connection that is inside a transaction."""
 
-    def __init__(self, connection: Connection, map_number: int, geometry_digest: bytes, vectors: KnownVectors) -> None:
+    def __init__(
+        self,
+        connection: Connection,
+        map_number: int,
+        geometry_digest: bytes,
+        vectors: KnownVectors,
+        objects: ColdReads,
+    ) -> None:
         self._connection = connection
+        self._objects = objects
         self._map = map_number
         self._geometry_digest = geometry_digest
         self._vectors = vectors
@@ -73,10 +82,19 @@ class PgSnapshot:
         return chain
 
     def cell(self, key: CellKey) -> CellRow | None:
-        """One cell with its body."""
-        query = f"SELECT {CELL_COLUMNS}, body, stamps FROM cell WHERE {OF_MAP} AND cell = %(key)s"
+        """One cell with its body.
+
+        Raises:
+            AwayError: it is in the object store, which does not answer.
+        """
+        query = f"SELECT {CELL_COLUMNS}, body, stamps, object FROM cell WHERE {OF_MAP} AND cell = %(key)s"
         row = first(self._connection, query, {"map": self._map, "key": key})
-        return cell_row(row) if row else None
+        if row is None:
+            return None
+        *columns, body, stamps, name = row
+        if name is not None:
+            body, stamps = split_cell_object(self._objects.get(name))
+        return cell_row((*columns, body, stamps))
 
     def cells(
         self, *, after_seq: int = -1, after_key: int = -1, limit: int | None = None, box: Box | None = None
@@ -160,13 +178,23 @@ class PgSnapshot:
         return frozenset(CellKey(cell) for (cell,) in rows(self._connection, query, values))
 
     def diff(self, commit: CommitId, key: CellKey) -> bytes | None:
-        """The bytes of a commit's evidence in a cell; None if they are not kept any more."""
+        """The bytes of a commit's evidence in a cell; None if they are not kept any more.
+
+        Raises:
+            AwayError: they are in the object store, which does not answer.
+        """
         number = first(
             self._connection, f"SELECT number FROM commits WHERE {OF_COMMIT}", (self._map, *commit.author, commit.n)
         )
-        query = f"SELECT body FROM diff WHERE {OF_MAP} AND commit_number = %(number)s AND cell = %(key)s"
-        body: bytes | None = first(self._connection, query, {"map": self._map, "number": number, "key": key})
-        return body
+        query = (
+            "SELECT body, segment, start_bytes, size_bytes FROM diff"
+            f" WHERE {OF_MAP} AND commit_number = %(number)s AND cell = %(key)s"
+        )
+        found = first(self._connection, query, {"map": self._map, "number": number, "key": key})
+        if found is None:
+            return None
+        body, name, start, size_bytes = found
+        return body if name is None else self._objects.part(name, start=start, size_bytes=size_bytes) or b""
 
     def tip(self, author: Author) -> tuple[int, bytes] | None:
         """Highest folded number of an author and its SHA-256."""

@@ -15,6 +15,7 @@ from cairn_map.evidence.fingerprint import ZERO
 from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.store.admission import OWN_WORD, Grounds
+from cairn_server.store.objects.cold_bytes import ColdReads
 from cairn_server.store.postgres.branches import PgBranches
 from cairn_server.store.postgres.connections import NOTING, Connection, Connections, first
 from cairn_server.store.postgres.folds import PgLeases, write_fold
@@ -58,14 +59,29 @@ NOTING_CONNECTIONS = 12
 class PgStore(PgReads):
     """`store.Store` in a database."""
 
-    def __init__(self, url: str, *, connections: int = CONNECTIONS, clocks: Clocks = CLOCKS) -> None:
+    def __init__(
+        self,
+        url: str,
+        *,
+        connections: int = CONNECTIONS,
+        clocks: Clocks = CLOCKS,
+        objects: ColdReads | None = None,
+        size_bytes_max: int | None = None,
+    ) -> None:
         """Open or make the store, whose age goes on by these clocks.
+
+        Args:
+            url: of the database.
+            connections: most of them to the database.
+            clocks: of this process.
+            objects: object store in which some of its bytes may be.
+            size_bytes_max: room for the database, which it does not say itself.
 
         Raises:
             BadInputError: kind `bad_store` or `store_version` (`schema.prepare`).
         """
-        prepare(url)
-        super().__init__(Connections(url, limit=connections))
+        prepare(url, has_objects=objects is not None)
+        super().__init__(Connections(url, limit=connections), objects)
         self._noting = Connections(url, limit=NOTING_CONNECTIONS, settings=NOTING)
         self._threads = WritingThreads(self._noting)
         with self._connections.lent() as connection:
@@ -75,7 +91,9 @@ class PgStore(PgReads):
         self.uses = PgUses(self._connections)
         self.shares = PgShares(self._connections)
         self.audit_log = PgAuditLog(self._connections)
-        self.health = PgHealth(self._connections, self._threads, self.age)
+        self.health = PgHealth(
+            self._connections, self._threads, self.age, objects=self._objects, size_bytes_max=size_bytes_max
+        )
         self.leases = PgLeases(self._connections)
         self.notes = PgBranches(self._connections, self._threads)
         self.replicas = PgReplicaNotes(url, self._connections, self._noting, self.notes)

@@ -1,0 +1,77 @@
+"""Bond of a database and the place of its cold bytes: each says which the other is, so that none is mistaken.
+
+The first server that is started with --objects makes it. The bucket may move: what counts is the object that marks it.
+"""
+
+import secrets
+from contextlib import suppress
+
+from cairn_map.errors import BadInputError
+from cairn_server.store.objects.bucket import Bucket
+from cairn_server.store.objects.cold_bytes import AwayError
+from cairn_server.store.postgres.connections import Connection, Connections, first
+from cairn_server.store.postgres.schema import BOUND_OLDEST
+
+MARK = "cairn-store"
+"""Object that says which database's bytes are next to it."""
+PROBE = b"cairn"
+
+
+def bind(connections: Connections, bucket: Bucket, url: str) -> None:
+    """Bind a database to a bucket, or find them bound; the bucket is tried first.
+
+    Raises:
+        BadInputError: kind `bad_objects`: it cannot be reached, written, read or deleted from, or is another store's.
+        CairnError: the database does not answer.
+    """
+    _try(bucket, url)
+    with connections.lent() as connection:
+        known = first(connection, "SELECT id FROM object_store")
+        is_used = known is not None and first(connection, "SELECT 1 FROM settled LIMIT 1") is not None
+    found = bucket.get(MARK)
+    mark = None if found is None else found.decode(errors="replace")
+    if mark is not None and mark != known:
+        raise _bad(url, "it has the bytes of another store; name an empty prefix, s3://BUCKET/PREFIX")
+    if mark is None and is_used:
+        raise _bad(url, "it does not have the bytes of this store; name the bucket and prefix that were used until now")
+    if mark is None:
+        bucket.put(MARK, connections.run(lambda connection: _note(connection, url)).encode())
+    elif known is not None:
+        with connections.lent() as connection:
+            connection.execute("UPDATE object_store SET url = %s WHERE url <> %s", (url, url))
+
+
+def _note(connection: Connection, url: str) -> str:
+    """Note the bond; its id, which another server may have drawn."""
+    connection.execute("UPDATE cairn_schema SET oldest = greatest(oldest, %s)", (BOUND_OLDEST,))
+    query = "INSERT INTO object_store (one, id, url) VALUES (true, %s, %s) ON CONFLICT (one) DO NOTHING"
+    connection.execute(query, (secrets.token_hex(16), url))
+    return str(first(connection, "SELECT id FROM object_store"))
+
+
+def _try(bucket: Bucket, url: str) -> None:
+    """Write, read, list and delete an object.
+
+    Raises:
+        BadInputError: kind `bad_objects`.
+    """
+    name = f"probes/{secrets.token_hex(8)}"
+    try:
+        bucket.put(name, PROBE)
+        if bucket.part(name, start=1, size_bytes=len(PROBE) - 1) != PROBE[1:]:
+            raise AwayError(f"what was written as {name} cannot be read")
+        if not any(name in page for page in bucket.names("probes")):
+            raise AwayError(f"what was written as {name} is not listed")
+        bucket.delete(name)
+    except AwayError as exc:
+        with suppress(AwayError):
+            bucket.delete(name)
+        raise _bad(url, exc.message) from exc
+
+
+def _bad(url: str, why: str) -> BadInputError:
+    return BadInputError(
+        "bad_objects",
+        f"--objects {url}: {why}. Credentials and endpoint are taken from AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, "
+        "AWS_REGION and AWS_ENDPOINT_URL; the key has to write, read, list and delete objects",
+    )
