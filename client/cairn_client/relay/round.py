@@ -197,6 +197,22 @@ def relay_round(resting: Undelivered) -> Conversation[RelayReport]:
     return report
 
 
+def copy_round(resting: Undelivered) -> Conversation[RelayReport]:
+    """Hand over what the other side lacks, and take nothing back.
+
+    Raises:
+        UnreachableError: a place does not say what it holds.
+        DeniedError: a server does not know this relay.
+    """
+    report = RelayReport()
+    held = {}
+    for side in RelaySide:
+        held[side] = yield from AskHeld(side)
+    report.split = _split(held[RelaySide.HERE], held[RelaySide.THERE])
+    yield from _hand_over(RelaySide.HERE, RelaySide.THERE, held, resting, report)
+    return report
+
+
 def _hand_over(
     source: RelaySide, target: RelaySide, held: dict[RelaySide, Held], resting: Undelivered, report: RelayReport
 ) -> Conversation[None]:

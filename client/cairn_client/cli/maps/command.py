@@ -2,6 +2,7 @@
 
     $ cairn map create http://127.0.0.1:8750/maps/lab --voxel 0.04
     map lab: voxels of 4 cm, cells of 5.12 m, channels colour, intensity, temperature
+    $ cairn map copy http://127.0.0.1:8750/maps/lab https://maps.example.org/maps/lab --follow
     $ cairn map ls http://127.0.0.1:8750
     $ cairn map info http://127.0.0.1:8750/maps/lab
     $ cairn map get http://127.0.0.1:8750/maps/lab 0,0,0 -o cell.ply
@@ -36,7 +37,7 @@ from cairn_client.cli.arguments import (
     shown_bytes,
     shown_length,
 )
-from cairn_client.cli.maps import branch_table, create, map_export, map_log, query, render, robots
+from cairn_client.cli.maps import branch_table, create, map_export, map_log, query, render, robots, server_copy
 from cairn_client.http.api import MapApi
 from cairn_client.sync.responses import one_line
 from cairn_map.errors import BadInputError
@@ -50,6 +51,7 @@ def main(argv: list[str]) -> int:
     """Run one of the subcommands."""
     parts = (
         create.add_parser,
+        server_copy.add_parser,
         _add_ls,
         _add_info,
         branch_table.add_parser,
