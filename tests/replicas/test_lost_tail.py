@@ -1,10 +1,11 @@
-"""A short run of `tests.replicas lost-tail`: the order of commits is lost, and the newest ones."""
+"""Short runs of `tests.replicas lost-tail` and `restore`: robots bring back what an older database lacks."""
 
 from pathlib import Path
 
 import pytest
-from tests.fixtures.server.postgres import WHEEL, programs_of
+from tests.fixtures.server.postgres import SYSTEM, WHEEL, programs_of
 from tests.replicas.lost_tail import lost_tail_run
+from tests.replicas.point_in_time import restore_run
 
 pytestmark = [pytest.mark.processes, pytest.mark.slow]
 
@@ -14,3 +15,9 @@ def test_servers_and_robots_go_on_when_the_newest_commits_are_lost(tmp_path: Pat
     said = "\n".join(f"{what}: {value}" for what, value in found.rows())
     assert found.is_sound, said
     assert found.frames["delta"] > 20 and found.frames["reset"] > 0, said
+
+
+def test_robots_bring_back_what_a_restore_to_a_point_in_time_takes_away(tmp_path: Path) -> None:
+    found = restore_run(tmp_path, programs_of(SYSTEM), seconds=0.7)
+    said = "\n".join(f"{what}: {value}" for what, value in found.rows())
+    assert found.is_sound, said
