@@ -7,7 +7,7 @@ from tests.fixtures.server.postgres import PostgresServer, new_database
 from tests.fixtures.server.replicas import Servers
 from tests.fixtures.server.two_servers_contract import Stores, TwoServersContract, administered
 
-from cairn_server.store.postgres import tokens as postgres_tokens
+from cairn_server.store import known_tokens
 from cairn_server.store.postgres.store import PgStore
 from cairn_server.store.store import Store
 
@@ -38,4 +38,4 @@ class TestTwoServersOnPostgres(TwoServersContract):
     @pytest.fixture(autouse=True)
     def a_second_later(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """Servers hear within a second of tokens that ended elsewhere: here at once."""
-        monkeypatch.setattr(postgres_tokens, "KNOWN_S", 0.0)
+        monkeypatch.setattr(known_tokens, "KNOWN_S", 0.0)

@@ -3,10 +3,10 @@
 import logging
 import threading
 import time
-from typing import Any
 
-from cairn_map.errors import ConflictError, NotFoundError
+from cairn_map.errors import ConflictError
 from cairn_map.wire.access_messages import AuditEntry, audit_chain
+from cairn_server.store.known_tokens import KnownTokens, check_changed, token_row
 from cairn_server.store.postgres.connections import Connection, Connections, first, rows
 from cairn_server.store.postgres.schema import NOW_S
 from cairn_server.store.postgres.writing_threads import WritingThreads
@@ -17,8 +17,6 @@ log = logging.getLogger(__name__)
 
 USED_EVERY_S = 10.0
 """Time between two writes of all tokens' times of last use."""
-KNOWN_S, KNOWN_MAX = 1.0, 4096
-"""Time for which a found token is not looked up again, and most such tokens; robots show one with each push."""
 AUDIT_ROWS_MAX = 100_000
 SERVER_STREAM = "server"
 """Stream of the lines that are about the server."""
@@ -39,11 +37,11 @@ class PgTokens:
         self._used: dict[str, tuple[float, float]] = {}
         """By name: steady time and age of the store when the token was shown last."""
         self._written_s = float("-inf")
-        self._known: dict[bytes, tuple[Token, float]] = {}
+        self._known = KnownTokens()
 
     def forget_known(self) -> None:
         """Look all tokens up again; called once a change is durable, before it is answered."""
-        self._known = {}
+        self._known.forget()
 
     def add(self, token: Token, secret_hash: bytes) -> None:
         """Keep a new token."""
@@ -67,7 +65,7 @@ class PgTokens:
         """Forget a token."""
 
         def job(connection: Connection) -> None:
-            _check_changed(connection.execute("DELETE FROM token WHERE name = %s", (name,)).rowcount, name)
+            check_changed(connection.execute("DELETE FROM token WHERE name = %s", (name,)).rowcount, name)
 
         self._connections.run(job)
         self.forget_known()
@@ -81,23 +79,11 @@ class PgTokens:
         self.write_used()
         self._threads.flush()
         with self._connections.lent() as connection:
-            return [_token(row) for row in rows(connection, f"{_SELECT} ORDER BY t.name")]
+            return [token_row(row) for row in rows(connection, f"{_SELECT} ORDER BY t.name")]
 
     def of_hash(self, secret_hash: bytes) -> Token | None:
         """The token of a secret, as it was at most a second ago, and not before it was changed here."""
-        known = self._known  # what is read before a change must not become known after it
-        token, until_s = known.get(secret_hash, (None, 0.0))
-        if token is not None and time.monotonic() < until_s:
-            return token
-        with self._connections.lent() as connection:
-            found = rows(connection, f"{_SELECT} WHERE t.hash = %s", (secret_hash,))
-        if not found:
-            return None
-        token = _token(found[0])
-        if len(known) >= KNOWN_MAX:
-            known.clear()
-        known[secret_hash] = token, time.monotonic() + KNOWN_S
-        return token
+        return self._known.get(secret_hash, lambda: self._look_up(secret_hash))
 
     def used(self, name: str) -> None:
         """Note that a token was shown just now; written some seconds later."""
@@ -126,10 +112,15 @@ class PgTokens:
 
         self._threads.note(job)
 
+    def _look_up(self, secret_hash: bytes) -> Token | None:
+        with self._connections.lent() as connection:
+            found = rows(connection, f"{_SELECT} WHERE t.hash = %s", (secret_hash,))
+        return token_row(found[0]) if found else None
+
     def _changed(self, query: str, name: str, *values: bytes) -> Token:
         def job(connection: Connection) -> Token:
-            _check_changed(connection.execute(query.encode(), (*values, name)).rowcount, name)
-            return _token(rows(connection, f"{_SELECT} WHERE t.name = %s", (name,))[0])
+            check_changed(connection.execute(query.encode(), (*values, name)).rowcount, name)
+            return token_row(rows(connection, f"{_SELECT} WHERE t.name = %s", (name,))[0])
 
         token = self._connections.run(job)
         self.forget_known()
@@ -193,26 +184,3 @@ def put_registration(connection: Connection, row: MapRow, robot: str, secret_has
 def remove_tokens_of(connection: Connection, row: MapRow, robot: str) -> None:
     """Forget every token of a robot on a map, inside a transaction."""
     connection.execute("DELETE FROM token WHERE map = %s AND robot = %s", (row.number, robot))
-
-
-def _token(columns: tuple[Any, ...]) -> Token:
-    *known, created_age_s, used_age_s, is_confirmed = columns
-    name, role, number, map_name, robot, created_s, expires_s, last_used_s = known
-    return Token(
-        name=name,
-        role=role,
-        map_number=number,
-        map_name=map_name,
-        robot=robot,
-        created_s=created_s,
-        expires_s=expires_s,
-        last_used_s=last_used_s,
-        created_age_s=created_age_s,
-        used_age_s=used_age_s,
-        is_confirmed=is_confirmed,
-    )
-
-
-def _check_changed(count: int, name: str) -> None:
-    if not count:
-        raise NotFoundError("no_such_token", f"there is no token {name[:80]!r}; `cairn token list` shows them")

@@ -8,8 +8,9 @@ from typing import Any
 
 import apsw
 
-from cairn_map.errors import ConflictError, NotFoundError, UnreachableError
+from cairn_map.errors import ConflictError, UnreachableError
 from cairn_map.wire.access_messages import AuditEntry, audit_chain
+from cairn_server.store.known_tokens import KnownTokens, check_changed, token_row
 from cairn_server.store.sqlite.ended_tokens import EndedTokens
 from cairn_server.store.sqlite.readers import Readers
 from cairn_server.store.sqlite.writer import Writer, first, rows
@@ -20,8 +21,6 @@ log = logging.getLogger(__name__)
 
 USED_EVERY_S = 10.0
 """Time between two writes of all tokens' times of last use."""
-KNOWN_S, KNOWN_MAX = 1.0, 4096
-"""Time for which a found token is not looked up again, and most such tokens; robots show one with each push."""
 AUDIT_ROWS_MAX = 100_000
 _SELECT = (
     "SELECT t.name, t.role, t.map, m.name, t.robot, t.created_s, t.expires_s, t.last_used_s, t.created_age_s,"
@@ -42,11 +41,11 @@ class SqliteTokens:
         self._used: dict[str, tuple[float, float]] = {}
         """By name: time and age of the store when the token was shown last."""
         self._written_s = float("-inf")
-        self._known: dict[bytes, tuple[Token, float]] = {}
+        self._known = KnownTokens()
 
     def forget_known(self) -> None:
         """Look all tokens up again; called once a change is durable, before it is answered."""
-        self._known = {}
+        self._known.forget()
 
     def add(self, token: Token, secret_hash: bytes) -> None:
         """Keep a new token."""
@@ -77,8 +76,8 @@ class SqliteTokens:
         def job(connection: apsw.Connection) -> Token:
             self._ended.note_named(connection, name)
             connection.execute("UPDATE token SET hash = ?, confirmed = 1 WHERE name = ?", (secret_hash, name))
-            _check_changed(connection, name)
-            return _token(connection.execute(f"{_SELECT} WHERE t.name = ?", (name,)).fetchall()[0])
+            check_changed(connection.changes(), name)
+            return token_row(connection.execute(f"{_SELECT} WHERE t.name = ?", (name,)).fetchall()[0])
 
         token = self._writer.run(job)
         self.forget_known()
@@ -90,7 +89,7 @@ class SqliteTokens:
         def job(connection: apsw.Connection) -> None:
             self._ended.note_named(connection, name)
             connection.execute("DELETE FROM token WHERE name = ?", (name,))
-            _check_changed(connection, name)
+            check_changed(connection.changes(), name)
 
         self._writer.run(job)
         self.forget_known()
@@ -100,8 +99,8 @@ class SqliteTokens:
 
         def job(connection: apsw.Connection) -> Token:
             connection.execute("UPDATE token SET confirmed = 1 WHERE name = ?", (name,))
-            _check_changed(connection, name)
-            return _token(connection.execute(f"{_SELECT} WHERE t.name = ?", (name,)).fetchall()[0])
+            check_changed(connection.changes(), name)
+            return token_row(connection.execute(f"{_SELECT} WHERE t.name = ?", (name,)).fetchall()[0])
 
         token = self._writer.run(job)
         self.forget_known()
@@ -111,23 +110,11 @@ class SqliteTokens:
         """All tokens, by name."""
         self.write_used()
         with self._readers.reading() as reader:
-            return [_token(row) for row in rows(reader, f"{_SELECT} ORDER BY t.name")]
+            return [token_row(row) for row in rows(reader, f"{_SELECT} ORDER BY t.name")]
 
     def of_hash(self, secret_hash: bytes) -> Token | None:
         """The token of a secret, as it was at most a second ago, and not before it was changed."""
-        known = self._known  # what is read before a change must not become known after it
-        token, until_s = known.get(secret_hash, (None, 0.0))
-        if token is not None and time.monotonic() < until_s:
-            return token
-        with self._readers.reading() as reader:
-            found = rows(reader, f"{_SELECT} WHERE t.hash = ?", (secret_hash,))
-        if not found:
-            return None
-        token = _token(found[0])
-        if len(known) >= KNOWN_MAX:
-            known.clear()
-        known[secret_hash] = token, time.monotonic() + KNOWN_S
-        return token
+        return self._known.get(secret_hash, lambda: self._look_up(secret_hash))
 
     def used(self, name: str) -> None:
         """Note that a token was shown just now; written some seconds later."""
@@ -141,6 +128,11 @@ class SqliteTokens:
     def write_used(self) -> None:
         """Write what is noted now."""
         self._submit().result()
+
+    def _look_up(self, secret_hash: bytes) -> Token | None:
+        with self._readers.reading() as reader:
+            found = rows(reader, f"{_SELECT} WHERE t.hash = ?", (secret_hash,))
+        return token_row(found[0]) if found else None
 
     def _submit(self) -> Any:
         with self._lock:
@@ -202,26 +194,3 @@ def put_registration(connection: apsw.Connection, row: MapRow, robot: str, secre
 def remove_tokens_of(connection: apsw.Connection, row: MapRow, robot: str) -> None:
     """Forget every token of a robot on a map, inside a transaction."""
     connection.execute("DELETE FROM token WHERE map = ? AND robot = ?", (row.number, robot))
-
-
-def _token(columns: tuple[Any, ...]) -> Token:
-    *known, created_age_s, used_age_s, is_confirmed = columns
-    name, role, number, map_name, robot, created_s, expires_s, last_used_s = known
-    return Token(
-        name=name,
-        role=role,
-        map_number=number,
-        map_name=map_name,
-        robot=robot,
-        created_s=created_s,
-        expires_s=expires_s,
-        last_used_s=last_used_s,
-        created_age_s=created_age_s,
-        used_age_s=used_age_s,
-        is_confirmed=bool(is_confirmed),
-    )
-
-
-def _check_changed(connection: apsw.Connection, name: str) -> None:
-    if not connection.changes():
-        raise NotFoundError("no_such_token", f"there is no token {name[:80]!r}; `cairn token list` shows them")
