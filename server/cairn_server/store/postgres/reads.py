@@ -1,7 +1,7 @@
 """Reads of a PostgreSQL store outside a snapshot: maps, and commits with their evidence."""
 
 from collections import defaultdict
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -41,9 +41,8 @@ class PgReads:
                 found = rows(connection, f"{query} ORDER BY name")
             else:
                 found = rows(connection, f"{query} WHERE map = ANY(%s) ORDER BY name", (list(numbers),))
-            return [
-                (self._map_row(connection, number, seal_key), Cursor(*cursor)) for number, seal_key, *cursor in found
-            ]
+            known = self._map_rows(connection, [(number, seal_key) for number, seal_key, *_ in found])
+        return [(row, Cursor(*cursor)) for row, (_, _, *cursor) in zip(known, found, strict=True)]
 
     def waiting_maps(self) -> list[MapRow]:
         """Maps with commits to be folded, or with a retract under way, by name."""
@@ -111,23 +110,23 @@ class PgReads:
         """Maps that fit a clause of ours."""
         with self._connections.lent() as connection:
             found = rows(connection, f"SELECT map, seal_key FROM map {clause}", values)
-            return [self._map_row(connection, number, seal_key) for number, seal_key in found]
+            return self._map_rows(connection, found)
 
-    def _map_row(self, connection: Connection, number: int, seal_key: bytes) -> MapRow:
-        """The map of a number; read once, for a map never changes."""
-        known = self._maps.get(number)
+    def _map_rows(self, connection: Connection, found: Sequence[Sequence[Any]]) -> list[MapRow]:
+        """Maps by number and key of seals; each is read once, for a map never changes."""
         # In a store that was restored the number may be another map's.
-        if known is None or known.seal_key != seal_key:
-            query = "SELECT name, geometry, sensor_model FROM map WHERE map = %s"
-            name, geometry, sensor_model = first(connection, query, (number,))
-            known = self._maps[number] = MapRow(
-                number=number,
-                name=name,
-                geometry=Geometry.model_validate_json(geometry),
-                sensor_model=SensorModel.model_validate_json(sensor_model),
-                seal_key=seal_key,
-            )
-        return known
+        unknown = [number for number, key in found if number not in self._maps or self._maps[number].seal_key != key]
+        if unknown:
+            query = "SELECT map, name, geometry, sensor_model, seal_key FROM map WHERE map = ANY(%s)"
+            for number, name, geometry, sensor_model, seal_key in rows(connection, query, (unknown,)):
+                self._maps[number] = MapRow(
+                    number=number,
+                    name=name,
+                    geometry=Geometry.model_validate_json(geometry),
+                    sensor_model=SensorModel.model_validate_json(sensor_model),
+                    seal_key=seal_key,
+                )
+        return [self._maps[number] for number, _ in found]
 
     def _commit(self, row: MapRow, commit: CommitId, clause: str) -> StoredCommit | None:
         with self._connections.snapshot() as connection:

@@ -13,6 +13,10 @@ from cairn_server.store.replica_notes import UseAnswer, UseBounds
 from cairn_server.store.store_rows import Robot, Use
 
 MINUTE_S = 60
+TRIES_MAX = 4
+"""Most attempts to take what did not fit a moment ago, and does now."""
+NEXT_TO_NOTHING_S = 1e-3
+"""Wait for what fits already."""
 DAY = "floor(extract(epoch FROM clock_timestamp()) / 86400)::bigint"
 """SQL of the days since 1970."""
 SIZES = ("size_bytes", "cells", "bricks")
@@ -73,15 +77,19 @@ class PgUseAccounts:
             "commits": commits,
         }
         with self._noting.lent() as connection:
-            taken = first(connection, TAKE, values)
-            if taken is not None:
-                return UseAnswer(taken[0], Use(*taken[1:]))
-            day, *used, left = first(connection, LOOK, values) or (*first(connection, f"SELECT {DAY}, 0, 0, 0"), most)
-        of_day = Use(*used) + use
-        if most is None or left is None or not bounds.hold(of_day):
-            return UseAnswer(day, of_day)
-        # A turn may have come back since; then there is next to nothing to wait for.
-        return UseAnswer(day, of_day, max(1e-3, (1 - left) * MINUTE_S / most))
+            for _ in range(TRIES_MAX):
+                taken = first(connection, TAKE, values)
+                if taken is not None:
+                    return UseAnswer(taken[0], Use(*taken[1:]))
+                none = (*first(connection, f"SELECT {DAY}, 0, 0, 0"), most)
+                day, *used, left = first(connection, LOOK, values) or none
+                of_day = Use(*used) + use
+                if not bounds.hold(of_day):
+                    return UseAnswer(day, of_day)
+                # Use or a turn that came back since fits by now, and is taken all the same: nothing was yet.
+                if most is not None and left is not None and left < commits:
+                    return UseAnswer(day, of_day, max(NEXT_TO_NOTHING_S, (1 - left) * MINUTE_S / most))
+        return UseAnswer(day, of_day, NEXT_TO_NOTHING_S)
 
     def give_back(self, robot: Robot, use: Use, *, day: int, commits: int) -> None:
         """Give back what was taken on a day."""
@@ -99,7 +107,7 @@ class PgUseAccounts:
             if first(connection, TAKE_TURN, values) is not None:
                 return 0.0
             left = first(connection, f"SELECT {LEFT} FROM bucket AS a WHERE name = %(name)s", values)
-        return max(1e-3, (1 - (left or 0.0)) / per_s)
+        return max(NEXT_TO_NOTHING_S, (1 - (left or 0.0)) / per_s)
 
     def give_turn(self, bucket: str) -> None:
         """Put one back."""
