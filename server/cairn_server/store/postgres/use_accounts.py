@@ -76,8 +76,9 @@ class PgUseAccounts:
             "per_s": None if most is None else most / MINUTE_S,
             "commits": commits,
         }
+        tries = 0
         with self._noting.lent() as connection:
-            for _ in range(TRIES_MAX):
+            while True:
                 taken = first(connection, TAKE, values)
                 if taken is not None:
                     return UseAnswer(taken[0], Use(*taken[1:]))
@@ -89,7 +90,9 @@ class PgUseAccounts:
                 # Use or a turn that came back since fits by now, and is taken all the same: nothing was yet.
                 if most is not None and left is not None and left < commits:
                     return UseAnswer(day, of_day, max(NEXT_TO_NOTHING_S, (1 - left) * MINUTE_S / most))
-        return UseAnswer(day, of_day, NEXT_TO_NOTHING_S)
+                tries += 1
+                if tries == TRIES_MAX:
+                    return UseAnswer(day, of_day, NEXT_TO_NOTHING_S)
 
     def give_back(self, robot: Robot, use: Use, *, day: int, commits: int) -> None:
         """Give back what was taken on a day."""
