@@ -45,6 +45,8 @@ class LostTails:
     acked: int = 0
     frames: Counter[str] = field(default_factory=Counter)
     answers: Counter[str] = field(default_factory=Counter)
+    odd_ends: int = 0
+    """Replies whose end did not fit, since a robot had a cell that only the lost history had."""
     misfits: list[str] = field(default_factory=list)
     wrong: list[str] = field(default_factory=list)
     silence_s: float = 0.0
@@ -65,6 +67,7 @@ class LostTails:
         yield "rounds", ", ".join(f"{count} x {kind}" for kind, count in sorted(self.answers.items()))
         yield "longest time until a commit was acknowledged again", f"{self.silence_s:.1f} s"
         yield "all maps equal after", f"{self.settled_s:.1f} s at most"
+        yield "ends of replies that did not add up", f"{self.odd_ends}"
         yield "frames that only a fingerprint caught", f"{len(self.misfits)} {self.misfits[:5]}"
         yield "wrong", f"{self.wrong[:10]}"
 
@@ -101,6 +104,7 @@ def _lose_once(site: Site, folder: Path, seed: int, found: LostTails) -> None:
     found.acked += len(team.acked)
     found.frames += team.kinds
     found.answers += team.answers
+    found.odd_ends += team.odd_ends
     found.misfits += [f"seed {seed}: {text}" for text in team.misfits]
     found.wrong += [f"seed {seed}: {text}" for text in team.wrong]
 

@@ -41,8 +41,9 @@ RETRACT_SHARE = 0.05
 SETTLE_S = 60.0
 """Time in which all robots and the server come to one map."""
 LOG_PAGE = 1000
-MISFITS = (exchange.MISFIT, "do not add up")
-"""What a replica says of frames that do not lead to the server's cells."""
+ODD_END = "do not add up"
+"""What a replica says where a reply's end does not fit (SYNC.md rule 8): it holds a cell that only a lost history had,
+under a cursor that is not listed cell by cell. It then compares all fingerprints."""
 Digests = dict[CellKey, str]
 
 
@@ -63,6 +64,9 @@ class Team:
     older: int = 0
     """Replies of an older state than one that the robot was given before."""
     misfits: list[str] = field(default_factory=list)
+    """Frames that only their fingerprint shows to be wrong."""
+    odd_ends: int = 0
+    """Replies after which a robot compared all fingerprints."""
     wrong: list[str] = field(default_factory=list)
     acked_s: float = 0.0
     """Time of the newest acknowledged commit."""
@@ -210,7 +214,8 @@ def watched_misfits(team: Team) -> Iterator[None]:
     class Misfits(logging.Handler):
         def emit(self, record: logging.LogRecord) -> None:
             text = record.getMessage()
-            if any(misfit in text for misfit in MISFITS):
+            team.odd_ends += ODD_END in text
+            if exchange.MISFIT in text:
                 team.misfits.append(text)
 
     handler, log = Misfits(), logging.getLogger(exchange.__name__)
