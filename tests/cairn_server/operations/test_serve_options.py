@@ -125,4 +125,4 @@ def test_the_help_lists_every_setting_by_flag_or_by_name() -> None:
     assert "  fold_lag_max_s = 600\n" in text
     assert "  quotas.bytes_per_day = 128_000_000_000\n" in text
     named = {name for name in Settings.model_fields if f"  {name} = " in text or f"  {name}." in text}
-    assert len(named) == 14
+    assert len(named) == 18

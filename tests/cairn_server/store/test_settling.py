@@ -20,6 +20,7 @@ from cairn_map.evidence.grid import CellKey
 from cairn_server.folding.cells_at_rest import sound_cell
 from cairn_server.settings import Settings
 from cairn_server.store.objects.bucket import Bucket, open_bucket
+from cairn_server.store.objects.cold_bytes import MARK, AwayError
 from cairn_server.store.postgres.connections import Connection, Connections
 from cairn_server.store.postgres.schema import BOUND_OLDEST
 from cairn_server.store.postgres.store import PgStore
@@ -363,6 +364,18 @@ def test_a_cold_cell_is_found_to_be_read(store: ColdStore) -> None:
     assert store.settler.cell_count() == len(KEYS)
 
 
+def test_in_a_bucket_that_lost_everything_nothing_is_known_to_be_lost(store: ColdStore) -> None:
+    row = folded_map(store, *COMMITS)
+    store.settle(row)
+    store.bucket.delete(MARK)
+    for name in store.bucket.objects():
+        store.bucket.delete(name)
+    with store.snapshot(row) as snapshot, pytest.raises(AwayError):
+        snapshot.cell(KEYS[0])
+    with pytest.raises(AwayError):
+        store.folded(row, COMMITS[0].id)
+
+
 # Start
 
 
@@ -389,6 +402,7 @@ def test_the_bucket_of_another_store_is_refused(newest_postgres: PostgresServer,
 def test_an_empty_bucket_is_refused_once_there_are_cold_bytes(database: Database) -> None:
     bucket = SwitchedBucket()
     with closing(ColdStore(database.url, bucket)) as store:
+        assert store.settler.claim()
         store.settle(folded_map(store, *COMMITS))
     assert "does not have the bytes of this store" in refusal_of(database.url, SwitchedBucket()).message
 
@@ -421,6 +435,7 @@ def test_a_bucket_that_is_not_there_or_without_rights_is_refused(
 
 def test_a_real_bucket_keeps_gives_lists_and_deletes(object_place: ObjectPlace) -> None:
     bucket = object_place.bucket
+    bucket.put(MARK, b"cairn")
     bucket.put_all([("cells/1/2/a", b"123456"), ("cells/1/2/b", b"")])
     assert bucket.get("cells/1/2/a") == b"123456"
     assert bucket.get("cells/1/2/b") == b""

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 from obstore.exceptions import BaseError
 from obstore.store import MemoryStore, S3Store, from_url
 
-from cairn_server.store.objects.cold_bytes import AwayError
+from cairn_server.store.objects.cold_bytes import MARK, AwayError
 
 if TYPE_CHECKING:
     from obstore.store import ClientConfig, RetryConfig
@@ -64,7 +64,7 @@ class Bucket:
             try:
                 return bytes(self._store.get(name).bytes())
             except FileNotFoundError:
-                return None
+                return self._missing(name)
 
     def part(self, name: str, *, start: int, size_bytes: int) -> bytes | None:
         """Bytes of an object from `start` on; None: there is no such object, or it is shorter.
@@ -78,7 +78,7 @@ class Bucket:
             try:
                 data = bytes(self._store.get_range(name, start=start, length=size_bytes))
             except FileNotFoundError:
-                return None
+                return self._missing(name)
         return data if len(data) == size_bytes else None
 
     def put(self, name: str, data: bytes) -> None:
@@ -124,6 +124,15 @@ class Bucket:
         with self._answers(f"list {prefix}"):
             for page in self._store.list(prefix, chunk_size=PAGE):
                 yield [found["path"] for found in page]
+
+    def _missing(self, name: str) -> None:
+        """Nothing, if other objects are there: in a bucket that lost its mark, too, nothing is known to be lost.
+
+        Raises:
+            FileNotFoundError: there is no mark either.
+        """
+        if name != MARK:
+            self._store.head(MARK)
 
     @contextmanager
     def _answers(self, what: str) -> Iterator[None]:

@@ -15,6 +15,8 @@ from cairn_map.errors import UnreachableError
 
 HEAD = struct.Struct("<Q")
 """Head of a cell's object: size of its bytes, which come before its stamps."""
+MARK = "cairn-store"
+"""Object that says which database's bytes are next to it."""
 NONCE_BYTES = 8
 RETRY_S = 5.0
 """Seconds after which a client may ask again for what an object store did not give."""

@@ -92,7 +92,8 @@ class PgSnapshot:
         if row is None:
             return None
         *columns, body, stamps, name = row
-        if name is not None:
+        # A fold by an older program leaves the name of the object that it replaced.
+        if body is None:
             body, stamps = split_cell_object(self._objects.get(name))
         return cell_row((*columns, body, stamps))
 
@@ -194,7 +195,7 @@ class PgSnapshot:
         if found is None:
             return None
         body, name, start, size_bytes = found
-        return body if name is None else self._objects.part(name, start=start, size_bytes=size_bytes) or b""
+        return body if body is not None else self._objects.part(name, start=start, size_bytes=size_bytes) or b""
 
     def tip(self, author: Author) -> tuple[int, bytes] | None:
         """Highest folded number of an author and its SHA-256."""

@@ -8,12 +8,10 @@ from contextlib import suppress
 
 from cairn_map.errors import BadInputError
 from cairn_server.store.objects.bucket import Bucket
-from cairn_server.store.objects.cold_bytes import AwayError
+from cairn_server.store.objects.cold_bytes import MARK, AwayError
 from cairn_server.store.postgres.connections import Connection, Connections, first
 from cairn_server.store.postgres.schema import BOUND_OLDEST
 
-MARK = "cairn-store"
-"""Object that says which database's bytes are next to it."""
 PROBE = b"cairn"
 
 
@@ -27,7 +25,8 @@ def bind(connections: Connections, bucket: Bucket, url: str) -> None:
     _try(bucket, url)
     with connections.lent() as connection:
         known = first(connection, "SELECT id FROM object_store")
-        is_used = known is not None and first(connection, "SELECT 1 FROM settled LIMIT 1") is not None
+        # A settler claims before it makes its first object.
+        is_used = first(connection, "SELECT 1 FROM object_store WHERE holder IS NOT NULL") is not None
     found = bucket.get(MARK)
     mark = None if found is None else found.decode(errors="replace")
     if mark is not None and mark != known:

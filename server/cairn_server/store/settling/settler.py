@@ -254,6 +254,7 @@ class Settler:
         }
 
         def swap(connection: Connection) -> int:
+            lock_head(connection, row)  # or evidence that is forgotten now would not be counted off the segment
             if not rows(connection, LOCK_NOTES, (row.number, [name])):
                 return 0
             moved = first(connection, SWAP_DIFFS, values)
