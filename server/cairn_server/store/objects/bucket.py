@@ -64,7 +64,8 @@ class Bucket:
             try:
                 return bytes(self._store.get(name).bytes())
             except FileNotFoundError:
-                return self._missing(name)
+                self._check_mark(name)
+                return None
 
     def part(self, name: str, *, start: int, size_bytes: int) -> bytes | None:
         """Bytes of an object from `start` on; None: there is no such object, or it is shorter.
@@ -78,7 +79,8 @@ class Bucket:
             try:
                 data = bytes(self._store.get_range(name, start=start, length=size_bytes))
             except FileNotFoundError:
-                return self._missing(name)
+                self._check_mark(name)
+                return None
         return data if len(data) == size_bytes else None
 
     def put(self, name: str, data: bytes) -> None:
@@ -125,8 +127,8 @@ class Bucket:
             for page in self._store.list(prefix, chunk_size=PAGE):
                 yield [found["path"] for found in page]
 
-    def _missing(self, name: str) -> None:
-        """Nothing, if other objects are there: in a bucket that lost its mark, too, nothing is known to be lost.
+    def _check_mark(self, name: str) -> None:
+        """Refuse to call an object lost in a bucket that lost its mark, too: it may be a wrong or an empty one.
 
         Raises:
             FileNotFoundError: there is no mark either.
