@@ -68,7 +68,7 @@ def first_error(exc: ValidationError) -> str:
         return f"more than {COMPLAINTS_MAX} fields are wrong"
     first = exc.errors(include_url=False, include_context=False, include_input=False)[0]
     where = ".".join(str(part) for part in first["loc"]) or "document"
-    return f"{where[:200]}: {first['msg'][:200]}"
+    return f"{where[:200]}: {first['msg'].removeprefix('Value error, ')[:200]}"
 
 
 def exit_code_of(exc: CairnError) -> int:

@@ -26,7 +26,7 @@ from cairn_server.sync.checks import check_pool, commit_checks
 from cairn_server.views import export_tickets, map_exports, map_views
 
 KIND = re.compile(r"[a-z]+(_[a-z]+)*")
-RAISERS = ("_problem", "send_problem")
+RAISERS = ("_problem", "send_problem", "__init__")
 
 
 def kinds_in(folder: str) -> set[str]:

@@ -575,8 +575,8 @@ SWITCHES = (
         11,
         "a retract takes effect once per target",
         FOLDING,
-        "if not self._is_retracted(target):",
-        "if True:",
+        "if self._is_retracted(target):",
+        "if False:",
         "cairn_server/sync/test_retract.py",
     ),
     Switch(

@@ -75,7 +75,8 @@ def _checks(target: str | None, others: list[str], tokens: OriginTokens) -> Iter
     if target is None or "://" in target:
         yield disk_check(Path())
     if target is not None and "://" in target:
-        yield from _of_url(target, tokens.of(target), [(other, tokens.of(other)) for other in others])
+        bound = tokens.bound_to(target)
+        yield from _of_url(target, bound.of(target), [(other, bound.of(other)) for other in others])
     elif target is not None:
         yield from folder_checks(Path(target))
         link = _link_of(Path(target))

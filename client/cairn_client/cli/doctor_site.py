@@ -11,6 +11,7 @@ from cairn_client.cli.doctor_checks import Check, CheckResult
 from cairn_client.http.api import MapApi
 from cairn_map.errors import CairnError, DeniedError, NotFoundError
 from cairn_map.wire.access_messages import ServerInfo, SiteInfo
+from cairn_map.wire.origins import origin_of
 
 ASKS = 10
 """Requests to each address: a proxy that picks one of two servers by chance shows one alone once in 500 times."""
@@ -23,14 +24,17 @@ CLOCK_WARN_S = 5.0
 def site_checks(addresses: Sequence[tuple[str, str | None]]) -> Iterator[Check]:
     """Checks of the servers behind these URLs, each with a token."""
     answers: list[tuple[str, SiteInfo]] = []
-    for url, token in addresses:
+    for place, (url, token) in enumerate(addresses):
         try:
             answers += _asked(url, token)
         except (DeniedError, NotFoundError) as exc:
             if exc.kind == "no_route":
                 advice = "update it: it does not say which servers there are"
                 yield Check("servers", CheckResult.WARN, f"the server at {url} is of an older version", advice)
-            return  # the check of the token says the rest
+            elif place > 0:  # what the first one says of its token is a check of its own
+                advice = f"give it its own token: --token {origin_of(url)}=TOKEN"
+                yield Check("servers", CheckResult.FAIL, f"{url}: {exc.message} [{exc.kind}]", advice)
+            return
         except CairnError as exc:
             yield Check("servers", CheckResult.FAIL, f"{url}: {exc.message} [{exc.kind}]", "look at that server's log")
             return

@@ -184,12 +184,8 @@ def relay_round(resting: Undelivered) -> Conversation[RelayReport]:
         UnreachableError: a place does not say what it holds.
         DeniedError: a server does not know this relay.
     """
-    # What both sides hold, and whether they hold other bytes under the same ids.
     report = RelayReport()
-    held = {}
-    for side in RelaySide:
-        held[side] = yield from AskHeld(side)
-    report.split = _split(held[RelaySide.HERE], held[RelaySide.THERE])
+    held = yield from _ask_both(report)
     # From here to there, then back; a direction that breaks off does not stop the other.
     yield from _hand_over(RelaySide.HERE, RelaySide.THERE, held, resting, report)
     report.is_all_there = not (report.has_more or report.cut or resting.may_come_later(RelaySide.THERE))
@@ -205,12 +201,18 @@ def copy_round(resting: Undelivered) -> Conversation[RelayReport]:
         DeniedError: a server does not know this relay.
     """
     report = RelayReport()
+    held = yield from _ask_both(report)
+    yield from _hand_over(RelaySide.HERE, RelaySide.THERE, held, resting, report)
+    return report
+
+
+def _ask_both(report: RelayReport) -> Conversation[dict[RelaySide, Held]]:
+    """Ask what both sides hold, and whether they hold other bytes under the same ids."""
     held = {}
     for side in RelaySide:
         held[side] = yield from AskHeld(side)
     report.split = _split(held[RelaySide.HERE], held[RelaySide.THERE])
-    yield from _hand_over(RelaySide.HERE, RelaySide.THERE, held, resting, report)
-    return report
+    return held
 
 
 def _hand_over(

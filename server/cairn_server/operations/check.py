@@ -88,8 +88,7 @@ def _check_database(url: str, objects: str | None, *, is_repair: bool) -> int:
     try:
         open_store, _ = store_of(Settings(store=url, objects=objects))
     except ValidationError as exc:
-        flag = "--objects" if "objects" in exc.errors()[0]["loc"] else "--store"
-        raise BadInputError("bad_setting", f"{flag}: {first_error(exc)}") from exc
+        raise BadInputError("bad_setting", f"--{first_error(exc)}") from exc
     store = open_store()
     try:
         return _reported(check_all(store))

@@ -190,7 +190,11 @@ def settings_of(args: argparse.Namespace) -> Settings:
         first = exc.errors()[0]
         names = [str(part) for part in first["loc"]]
         unknown = first["type"] == "extra_forbidden"
-        message = "there is no such setting; see `cairn serve --help`" if unknown else first["msg"]
+        message = (
+            "there is no such setting; see `cairn serve --help`"
+            if unknown
+            else first["msg"].removeprefix("Value error, ")
+        )
         raise BadInputError("bad_setting", f"{_origin(names, given, file)}: {message}") from exc
 
 

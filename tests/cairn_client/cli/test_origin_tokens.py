@@ -49,12 +49,15 @@ def test_another_servers_url_gets_no_token_unless_it_has_one_of_its_own(
         "map create": [("map", "create", own.replace(MAP, "new"), "--from", its)],
         "diff": [("diff", own, its), ("diff", copy, own, "--token", f"{other.url}=x"), ("diff", copy)],
         "relay": [("relay", own, its), ("relay", its, tmp_path / "bag", "--token-there", "x")],
+        "map copy": [("map", "copy", own, its)],
+        "doctor": [("doctor", own, other.url)],
     }
     assert found.keys() == commands_with_two_places()
-    for command in [found["map create"][0], found["diff"][0], found["relay"][0]]:
+    for command in [found[name][0] for name in ("map create", "diff", "relay", "map copy")]:
         said = cairn(*command, folder=tmp_path, code=1)
         assert f"no token for {other.url}" in said, said
         assert f"--token {other.url}=TOKEN" in said, said
+    cairn(*found["doctor"][0], folder=tmp_path, code=1)  # it names the address, and sends it no token either
     assert other.shown
     assert set(other.shown) == {None}
     for command in found["diff"][1:]:
