@@ -28,6 +28,7 @@ from tests.bench.imports import import_rows
 from tests.bench.integration import integration_rows
 from tests.bench.large_map import large_map_rows
 from tests.bench.links import link_rows
+from tests.bench.many_maps import many_map_rows
 from tests.bench.overlay import overlay_rows
 from tests.bench.peers import peer_rows
 from tests.bench.queries import query_rows
@@ -263,6 +264,7 @@ PARTS: dict[str, Callable[[bool], Iterator[Row]]] = {
     "scale": scale_rows,
     "server": server_rows,
     "large-map": large_map_rows,
+    "many-maps": many_map_rows,
     "simulation": simulation_rows,
     "start": start_rows,
     "surfaces": surface_rows,

@@ -25,6 +25,7 @@ def main() -> int:
     parser = argparse.ArgumentParser("python -m tests.crowd", description=__doc__)
     parser.add_argument("--robots", type=int, default=200, help="connections that stay open")
     parser.add_argument("--whole", type=int, default=2, help="more robots, which keep the map")
+    parser.add_argument("--servers", type=int, default=1, help="several share a PostgreSQL, and one more folds")
     parser.add_argument("--listeners", type=int, default=4, help="WebSockets")
     parser.add_argument("--seconds", type=float, default=600.0)
     parser.add_argument("--sync", type=float, default=2.0, metavar="SECONDS", help="between two fetches of a robot")
@@ -38,7 +39,13 @@ def main() -> int:
     _say(f"{len(seen_by.scans)} scans of {given.robot} seen in {time.perf_counter() - start_s:.0f} s")
     with tempfile.TemporaryDirectory() as folder:
         outcome = soak(
-            crowd, seen_by, Path(folder), whole_robots=given.whole, every_s=PROGRESS_S, progress=Progress().show
+            crowd,
+            seen_by,
+            Path(folder),
+            whole_robots=given.whole,
+            every_s=PROGRESS_S,
+            progress=Progress().show,
+            servers=given.servers,
         )
     for line in summary(outcome):
         _say(line)

@@ -96,7 +96,9 @@ class CrowdRobot:
         commit = f"{self.name}.{INCARNATION}.{self._pushed}"
         start_s = time.perf_counter()
         await self.link.ask("PUT", f"{self._path}/commits/{commit}", data, media_type=COMMIT_MEDIA_TYPE)
-        self._seen.pushes.seconds.append(time.perf_counter() - start_s)
+        now_s = time.perf_counter()
+        self._seen.pushes.seconds.append(now_s - start_s)
+        self._seen.pushed_s.append(now_s)
         self._pushed += 1
 
     async def fetch(self, times: Times) -> None:
@@ -177,7 +179,10 @@ async def listen(port: int, map_name: str, token: str, seen: Seen) -> None:
     try:
         async with connect(url, subprotocols=offered, compression=None) as socket:
             async for text in socket:
-                seen.events[str(text)[:24].split('"')[3]] += 1
+                event = json.loads(text)
+                seen.events[event["type"]] += 1
+                if event["type"] == "head":
+                    seen.heads.append((time.perf_counter(), _order(event["cursor"])))
             seen.errors[f"live: closed {socket.close_code}"] += 1
     except (WebSocketException, OSError) as exc:
         seen.errors[f"live: {_named(exc)}"] += 1

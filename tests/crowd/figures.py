@@ -44,11 +44,33 @@ class Seen:
     frames: Counter[FrameKind] = field(default_factory=Counter)
     events: Counter[str] = field(default_factory=Counter)
     """Live ones, by type."""
+    pushed_s: list[float] = field(default_factory=list)
+    """When pushes were answered, `perf_counter`."""
+    heads: list[tuple[float, int]] = field(default_factory=list)
+    """When a listener was told of a head, and log entries up to it."""
+    folded_before: int = 0
+    """Log entries before the first of these pushes."""
     errors: Counter[str] = field(default_factory=Counter)
     skipped: int = 0
     """Rounds that did not take place, because the one before took longer than the time between two."""
     sent_bytes: int = 0
     received_bytes: int = 0
+
+
+def fold_lags(pushed_s: Sequence[float], heads: Sequence[tuple[float, int]], before: int) -> Times:
+    """Time from the answer to the n-th push until a head had n entries more than `before`, as listeners heard of it.
+
+    Folding does not keep the order of arrival, so a single time may be another push's; their mean is the pushes' own.
+    """
+    found, heads = [], sorted(heads)
+    at = 0
+    for n, answered_s in enumerate(sorted(pushed_s), start=before + 1):
+        while at < len(heads) and heads[at][1] < n:
+            at += 1
+        if at == len(heads):
+            break
+        found.append(max(0.0, heads[at][0] - answered_s))
+    return Times(found)
 
 
 def rise_of(times_s: Sequence[float], values: Sequence[float]) -> tuple[float, float]:

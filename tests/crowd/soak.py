@@ -1,13 +1,13 @@
-"""One soak: a server of its own, a map of the building, the crowd on it, and what came of it."""
+"""One soak: servers of its own, a map of the building, the crowd on it, and what came of it."""
 
 import asyncio
 import multiprocessing
 import secrets
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -19,6 +19,8 @@ from tests.crowd.figures import Seen
 from tests.crowd.watch import Sample, Watch
 from tests.crowd.whole_robots import WholeReport, live_whole
 from tests.fixtures.server.live import Process
+from tests.fixtures.server.postgres import programs_of
+from tests.replicas.fault_run import postgres_in
 
 from cairn_client.http.api import MapApi
 from cairn_map.wire.messages import CreateMap, MapInfo
@@ -44,16 +46,23 @@ class Outcome:
     """Robots that stood at the head in the end."""
     exit_code: int
     complaints: str
-    """What the server wrote to standard error."""
+    """What the servers wrote to standard error."""
 
 
 Progress = Callable[[float, Seen, list[Sample]], None]
 
 
 def soak(
-    crowd: Crowd, seen_by: Survey, folder: Path, *, whole_robots: int, every_s: float, progress: Progress
+    crowd: Crowd,
+    seen_by: Survey,
+    folder: Path,
+    *,
+    whole_robots: int,
+    every_s: float,
+    progress: Progress,
+    servers: int = 1,
 ) -> Outcome:
-    """Let a crowd live on a server.
+    """Let a crowd live on a server, or on several.
 
     Args:
         crowd: how many robots, for how long.
@@ -62,27 +71,60 @@ def soak(
         whole_robots: how many more there are that keep the map.
         every_s: between two calls of `progress`.
         progress: told the seconds so far, and what was seen.
+        servers: one has its store in the folder; several share a PostgreSQL, and one more process folds.
     """
     token = secrets.token_urlsafe(32)
     secret = folder / "admin"
     secret.write_text(token)
-    server = Process(folder / "store", "--admin-token-file", str(secret))
-    try:
-        assert server.url is not None, "the server did not start"
-        with MapApi(server.url, token=token) as api:
-            api.create_map(MAP, CreateMap(geometry=seen_by.geometry))
-            asyncio.run(_lay_out(server.url, token, seen_by))
-            seen, watch = Seen(), Watch(server.pid, every_s=min(5.0, crowd.seconds / 20))
-            with watch, _whole_robots(server.url, token, whole_robots, seen_by, crowd) as pipe:
-                start_s = time.perf_counter()
-                tell = (lambda: progress(time.perf_counter() - start_s, seen, watch.samples), every_s)
-                at_head = asyncio.run(_live(crowd, seen_by, seen, api, _port(server.url), pipe, tell))
-                whole: WholeReport = pipe.recv()
-            info = api.map_info(MAP)
-    finally:
-        server.send(signal.SIGTERM)
-        exit_code, complaints = server.end()
-    return Outcome(crowd, seen, watch.samples, start_s, whole, info, at_head, exit_code, complaints)
+    options = "--admin-token-file", str(secret)
+    with _serving(folder, servers, *options) as site, MapApi(site.urls[0], token=token) as api:
+        api.create_map(MAP, CreateMap(geometry=seen_by.geometry))
+        asyncio.run(_lay_out(site.urls[0], token, seen_by))
+        seen, watch = Seen(folded_before=len(seen_by.stops)), Watch(site.pids, every_s=min(5.0, crowd.seconds / 20))
+        with watch, _whole_robots(site.urls[-1], token, whole_robots, seen_by, crowd) as pipe:
+            start_s = time.perf_counter()
+            tell = (lambda: progress(time.perf_counter() - start_s, seen, watch.samples), every_s)
+            at_head = asyncio.run(_live(crowd, seen_by, seen, api, [_port(url) for url in site.urls], pipe, tell))
+            whole: WholeReport = pipe.recv()
+        info = api.map_info(MAP)
+    return Outcome(crowd, seen, watch.samples, start_s, whole, info, at_head, site.exit_code, site.complaints)
+
+
+@dataclass(slots=True)
+class _Site:
+    """Servers of one store."""
+
+    urls: list[str]
+    pids: list[int]
+    """With those of what is behind them."""
+    exit_code: int = 0
+    """The worst, once they ended."""
+    complaints: str = ""
+
+
+@contextmanager
+def _serving(folder: Path, servers: int, *options: str) -> Iterator[_Site]:
+    with ExitStack() as stack:
+        members: list[Process] = []
+        pids: list[int] = []
+        if servers == 1:
+            members.append(Process(folder / "store", *options))
+        else:
+            postgres = stack.enter_context(postgres_in(programs_of("wheel")))
+            postgres.execute("CREATE DATABASE cairn")
+            pids.append(postgres.pid)
+            for n, role in enumerate(["--no-fold"] * servers + ["--fold-only"]):
+                members.append(Process(folder / f"store{n}", "--store", postgres.url("cairn"), role, *options))
+        assert all(member.url for member in members), "a server did not start"
+        site = _Site([str(member.url) for member in members[:servers]], pids + [member.pid for member in members])
+        try:
+            yield site
+        finally:
+            for member in members:
+                member.send(signal.SIGTERM)
+            ends = [member.end() for member in members]
+            site.exit_code = max(code for code, _ in ends)
+            site.complaints = "".join(said for _, said in ends)
 
 
 async def _lay_out(url: str, token: str, seen_by: Survey) -> None:
@@ -101,15 +143,15 @@ async def _live(
     seen_by: Survey,
     seen: Seen,
     api: MapApi,
-    port: int,
+    ports: Sequence[int],
     pipe: Connection,
     tell: tuple[Callable[[], None], float],
 ) -> int:
     """The crowd's life, and its last fetch; how many robots stand at the head then."""
     token = str(api.token)
     bodies = seen_by.scan_bodies()
-    robots = [CrowdRobot(port, token, MAP, n, bodies, seen) for n in range(crowd.robots)]
-    around = [asyncio.create_task(listen(port, MAP, token, seen)) for _ in range(crowd.listeners)]
+    robots = [CrowdRobot(ports[n % len(ports)], token, MAP, n, bodies, seen) for n in range(crowd.robots)]
+    around = [asyncio.create_task(listen(ports[n % len(ports)], MAP, token, seen)) for n in range(crowd.listeners)]
     around.append(asyncio.create_task(_every(*tell)))
     await live_together(crowd, robots, seen, start_s=time.perf_counter())
     with ThreadPoolExecutor(1) as aside:

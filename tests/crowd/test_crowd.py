@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from tests.crowd.building import survey
 from tests.crowd.crowd import Crowd
-from tests.crowd.figures import rise_of
+from tests.crowd.figures import fold_lags, rise_of
 from tests.crowd.link import BadAnswerError, Told
 from tests.crowd.soak import soak
 from tests.crowd.verdict import findings, summary
@@ -28,7 +28,7 @@ def test_a_small_crowd_is_served_without_an_error_and_ends_with_the_servers_map(
     outcome = soak(crowd, seen_by, tmp_path, whole_robots=1, every_s=60.0, progress=lambda *_: None)
     assert [line for line in findings(outcome) if "p99" not in line and "skipped" not in line] == []
     assert outcome.seen.events["head"] and outcome.seen.frames[FrameKind.DELTA]
-    assert len(outcome.seen.pushes) + outcome.whole.pushed + len(seen_by.stops) == outcome.info.commits
+    assert len(outcome.seen.pushes) + len(outcome.whole.pushed_s) + len(seen_by.stops) == outcome.info.commits
     assert any("compared byte for byte, 0 different" in line for line in summary(outcome))
 
 
@@ -41,6 +41,11 @@ def test_a_reply_is_read_as_far_as_its_cursor_and_its_end() -> None:
 def test_a_reply_that_is_not_whole_is_an_error(reply: bytes) -> None:
     with pytest.raises(BadAnswerError):
         Told.by(start_of_reply() + reply)
+
+
+def test_the_lag_of_a_push_ends_with_the_first_head_that_has_so_many_entries() -> None:
+    heads = [(11.0, 6), (12.0, 6), (13.5, 8)]
+    assert fold_lags([10.0, 12.5, 13.0, 14.0], heads, before=5).seconds == [1.0, 1.0, 0.5]
 
 
 def test_the_rise_of_a_line_is_told_from_what_lies_beside_it() -> None:

@@ -2,11 +2,13 @@
 
 from collections.abc import Iterator
 
-from tests.crowd.figures import rise_of
+from tests.crowd.figures import Times, fold_lags, rise_of
 from tests.crowd.soak import Outcome
 from tests.crowd.watch import Sample
 
 FETCH_P99_MS = 500.0
+PUSH_P99_MS = 150.0
+LAG_P99_MS = 3000.0
 SKIPPED_SHARE = 0.01
 """Of all rounds."""
 FLAT_SECONDS = 240.0
@@ -28,6 +30,10 @@ def findings(outcome: Outcome) -> list[str]:
         found.append(f"{crowd.robots - outcome.at_head} robots did not come to the head")
     if seen.fetches.ms(0.99) >= FETCH_P99_MS:
         found.append(f"p99 of fetches is {seen.fetches.ms(0.99):.0f} ms, to be below {FETCH_P99_MS:g}")
+    if seen.pushes.ms(0.99) >= PUSH_P99_MS:
+        found.append(f"p99 of pushes is {seen.pushes.ms(0.99):.0f} ms, to be below {PUSH_P99_MS:g}")
+    if (lag_ms := _lags(outcome).ms(0.99)) >= LAG_P99_MS:
+        found.append(f"p99 of the fold lag is {lag_ms:.0f} ms, to be below {LAG_P99_MS:g}")
     if seen.skipped > SKIPPED_SHARE * len(seen.fetches):
         found.append(f"{seen.skipped} rounds were skipped, of {len(seen.fetches)}")
     if (grown := _grown(outcome)) is not None:
@@ -47,12 +53,13 @@ def summary(outcome: Outcome) -> Iterator[str]:
     yield f"first fetch (whole map): {seen.joins}"
     yield f"fetch:  {seen.fetches}"
     yield f"push:   {seen.pushes}"
+    yield f"from a push's answer until listeners hear of a map with it: {_lags(outcome)}"
     yield f"status: {seen.reports}"
     frames = ", ".join(f"{kind.name.lower()} {count}" for kind, count in sorted(seen.frames.items()))
     yield f"received {seen.received_bytes / 1e6:.0f} MB, sent {seen.sent_bytes / 1e6:.0f} MB; frames: {frames}"
     yield f"live events: {dict(seen.events)}"
     yield (
-        f"whole robots: {whole.rounds} rounds, {whole.frames} frames, {whole.pushed} commits; "
+        f"whole robots: {whole.rounds} rounds, {whole.frames} frames, {len(whole.pushed_s)} commits; "
         f"{whole.cells} cells compared byte for byte, {len(whole.different)} different"
     )
     yield f"server's memory: {', '.join(_minutes(outcome))}"
@@ -61,6 +68,11 @@ def summary(outcome: Outcome) -> Iterator[str]:
     yield f"  over the last half: {rise / 1e6:+.2f} MB along the line, {noise / 1e6:.2f} MB (1 sigma) beside it"
     first, last = outcome.samples[0], outcome.samples[-1]
     yield f"server's processor time: {(last.cpu_s - first.cpu_s) / (last.time_s - first.time_s):.2f} of a core"
+
+
+def _lags(outcome: Outcome) -> Times:
+    seen = outcome.seen
+    return fold_lags(seen.pushed_s + outcome.whole.pushed_s, seen.heads, seen.folded_before)
 
 
 def _minutes(outcome: Outcome) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""A server's process from outside: memory and processor time, its children's included.
+"""Servers' processes from outside: memory and processor time, their children's included.
 
 Of memory that processes share, each one's share is counted (PSS): children are forks of one another.
 """
@@ -7,6 +7,7 @@ import os
 import re
 import threading
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -25,9 +26,9 @@ class Sample:
 class Watch:
     """Looks every so often, in a thread."""
 
-    def __init__(self, pid: int, *, every_s: float) -> None:
-        self.samples = [sample_of(pid)]
-        self._pid = pid
+    def __init__(self, pids: Sequence[int], *, every_s: float) -> None:
+        self.samples = [sample_of(pids)]
+        self._pids = pids
         self._every_s = every_s
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -41,16 +42,17 @@ class Watch:
     ) -> None:
         self._ending.set()
         self._thread.join()
-        self.samples.append(sample_of(self._pid))
+        self.samples.append(sample_of(self._pids))
 
     def _run(self) -> None:
         while not self._ending.wait(self._every_s):
-            self.samples.append(sample_of(self._pid))
+            self.samples.append(sample_of(self._pids))
 
 
-def sample_of(pid: int) -> Sample:
-    """What a process and its children hold and took now."""
-    now_s, found = time.perf_counter(), [_of_process(number) for number in (pid, *_children(pid))]
+def sample_of(pids: Sequence[int]) -> Sample:
+    """What processes and their children hold and took now."""
+    now_s = time.perf_counter()
+    found = [_of_process(number) for pid in pids for number in (pid, *_children(pid))]
     return Sample(now_s, sum(resident for resident, _ in found), sum(cpu_s for _, cpu_s in found))
 
 

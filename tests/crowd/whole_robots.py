@@ -29,7 +29,8 @@ class WholeReport:
 
     rounds: int = 0
     frames: int = 0
-    pushed: int = 0
+    pushed_s: list[float] = field(default_factory=list)
+    """When their commits were at the server, `perf_counter`."""
     cells: int = 0
     """Compared at the end."""
     different: list[str] = field(default_factory=list)
@@ -61,14 +62,15 @@ def live_whole(
     sync_s, push_s = times_s
     with tempfile.TemporaryDirectory() as folder:
         robots = [Robot(None, url, directory=Path(folder) / n, name=n, token=token, geometry=geometry) for n in names]
+        made = 0
         pushes_s = [time.perf_counter() + push_s * (n + 0.5) / len(robots) for n in range(len(robots))]
         while not pipe.poll(sync_s):
             for n, robot in enumerate(robots):
                 if time.perf_counter() >= pushes_s[n]:
-                    diff = diffs[(report.pushed * 11 + n) % len(diffs)]
+                    diff = diffs[(made * 11 + n) % len(diffs)]
                     robot.replica.commit(diff, facts_of(0))
                     pushes_s[n] += push_s
-                    report.pushed += 1
+                    made += 1
                 _round(robot, report)
         pipe.recv()
         for robot in robots:
@@ -84,7 +86,9 @@ def live_whole(
 
 def _round(robot: Robot, report: WholeReport) -> None:
     try:
-        report.frames += robot.sync().frames
+        found = robot.sync()
+        report.frames += found.frames
+        report.pushed_s += [time.perf_counter()] * found.pushed
         report.rounds += 1
     except CairnError as exc:
         report.errors.append(f"{robot.name}: {exc.kind}: {exc.message}")
