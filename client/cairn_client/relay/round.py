@@ -202,15 +202,17 @@ def copy_round(resting: Undelivered) -> Conversation[RelayReport]:
     """
     report = RelayReport()
     held = yield from _ask_both(report)
+    # One direction only: a copy may be of a map that its own robots go on with.
     yield from _hand_over(RelaySide.HERE, RelaySide.THERE, held, resting, report)
     return report
 
 
 def _ask_both(report: RelayReport) -> Conversation[dict[RelaySide, Held]]:
-    """Ask what both sides hold, and whether they hold other bytes under the same ids."""
+    """Ask what both sides hold."""
     held = {}
     for side in RelaySide:
         held[side] = yield from AskHeld(side)
+    # Whether they hold other bytes under the same ids: then a robot's disk was rolled back between its visits to both.
     report.split = _split(held[RelaySide.HERE], held[RelaySide.THERE])
     return held
 
