@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cairn_calib.cli.solve_options import add_solve_options, solve_by_options
+from cairn_calib.cli.solve_options import add_solve_options, read_by_options
 from cairn_calib.diagnosis.examination import examine
 from cairn_calib.report.report_files import refuse_overwriting, write_report
 from cairn_calib.report.report_images import report_images
@@ -31,6 +31,7 @@ from cairn_calib.rig.range_bias import RangeBias
 from cairn_calib.rig.rig import Rig, load_rig
 from cairn_calib.solve.board_views import BoardViews
 from cairn_calib.solve.solution import Solution
+from cairn_calib.solve.solve import solve_rig
 from cairn_calib.solve.solved_rig import solved_rig
 from cairn_map.errors import BadInputError
 
@@ -60,7 +61,8 @@ def run(args: argparse.Namespace) -> None:
     """Solve again, compare, and write the report."""
     refuse_overwriting(args.output, args.rig)
     rig = load_rig(args.rig)
-    again = solve_by_options(solve_arguments(rig, args.folders, shlex.split(args.solved_with), args.rig))
+    views, plan = read_by_options(solve_arguments(rig, args.folders, shlex.split(args.solved_with), args.rig))
+    again = solve_rig(views, plan)
     _refuse_other_inputs(rig, again.views, args.rig)
     off = sigmas_apart(rig, again)
     if not off < SAME_SIGMAS:

@@ -10,8 +10,10 @@
     rig.json: tof, left
     report.html: 1 warnings; the same as report.json
 
-A camera's name is its folder's. Images of one place of the board have the same last number in their names
-(tof03.png, left03.png). The first range camera is the rig's frame, else the first camera (--gauge).
+A camera's name is its folder's. Images of one place of the board are paired by their names: what differs from name to
+name of a folder is the frame (03 of tof03.png and of 03-left.jpg), as text: 200 and 0200 are two moments. The table
+that is printed first shows it; --frame '([0-9]+)$' says which part of a name counts. Cameras that share no frame, or
+one alone, are refused. The first range camera is the rig's frame, else the first camera (--gauge).
 
 First each camera is solved alone, then all of them with all places of the board. Corners count by their covariance
 and by each camera's own noise, which is estimated; corners off by more than 4 sigma are left out and counted. The
@@ -27,9 +29,8 @@ warning says so.
 
 Warnings name what the images do not determine, with threshold and measured value: tilt, distances, the image's
 edge, numbers that come from assumptions, halves of the images that contradict each other, single frames that much hangs
-on; and which image would help most. Images that leave a camera open (one view, parallel boards, cameras that never saw
-a board together) are refused. The report has it all, with residuals, coverage, and how certain each pixel is at 1, 2
-and 5 m.
+on; and which image would help most. Images that leave a camera open (one view, parallel boards) are refused. The report
+has it all, with residuals, coverage, and how certain each pixel is at 1, 2 and 5 m.
 """
 
 import argparse
@@ -37,12 +38,13 @@ import sys
 import time
 from typing import TYPE_CHECKING
 
-from cairn_calib.cli.solve_options import add_solve_options, solve_by_options
+from cairn_calib.cli.solve_options import add_solve_options, read_by_options
 from cairn_calib.diagnosis.examination import examine
 from cairn_calib.report.range_report import told_ranges
 from cairn_calib.report.report_files import refuse_overwriting, write_file, write_report
 from cairn_calib.report.report_images import report_images
 from cairn_calib.rig.calibration import Statistics
+from cairn_calib.solve.solve import solve_rig
 from cairn_calib.solve.solved_rig import solved_rig, statistics_of
 from cairn_map.progress import while_working
 
@@ -65,8 +67,11 @@ def add_parser(commands: "_SubParsersAction[argparse.ArgumentParser]") -> None:
 def run(args: argparse.Namespace) -> None:
     """Solve, and write the rig and, if asked for, the report."""
     refuse_overwriting(args.report, args.output)
+    views, plan = read_by_options(args)
+    sys.stdout.write(views.pairing_table())
+    sys.stdout.flush()
     with while_working("solving"):
-        solution = solve_by_options(args)
+        solution = solve_rig(views, plan)
         rig = solved_rig(solution, made_s=time.time())
     with while_working("comparing halves of the images, and without each of them"):
         seen = examine(solution, rig)

@@ -1,12 +1,10 @@
-"""Options of `cairn calib solve`, which `cairn calib report` reads as well, and the solve that they ask for."""
+"""Options of `cairn calib solve`, which `cairn calib report` reads as well: the views and the plan that they name."""
 
 import argparse
 from pathlib import Path
 
 from cairn_calib.rig.rig import Spectrum
-from cairn_calib.solve.board_views import add_ranges, read_board_views
-from cairn_calib.solve.solution import Solution
-from cairn_calib.solve.solve import solve_rig
+from cairn_calib.solve.board_views import BoardViews, add_ranges, read_board_views
 from cairn_calib.solve.solve_plan import PITCH_SIGMA, CameraPlan, SolvePlan, usual_plan
 from cairn_map.errors import BadInputError
 
@@ -19,6 +17,9 @@ def add_solve_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--output", type=Path, required=True, metavar="RIG.JSON")
     parser.add_argument("--report", type=Path, metavar="REPORT.HTML", help="for people; also as .json next to it")
+    parser.add_argument(
+        "--frame", metavar="REGEX", help="of image names without suffix; its group counts the places of the board"
+    )
     parser.add_argument("--gauge", metavar="NAME", help="the camera whose frame is the rig's")
     parser.add_argument("--name", default="rig", help="of the rig (rig)")
     parser.add_argument(
@@ -39,20 +40,20 @@ def add_solve_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--modulation-mhz", type=float, metavar="F", help="of its light, by the data sheet")
 
 
-def solve_by_options(args: argparse.Namespace) -> Solution:
-    """The solution of the corners, and ranges, that the options name, by the plan that they state.
+def read_by_options(args: argparse.Namespace) -> tuple[BoardViews, SolvePlan]:
+    """The corners, and ranges, that the options name, and the plan that they state: what `solve_rig` needs.
 
     Raises:
-        BadInputError: the options contradict each other, a file cannot be read, or the views do not determine the rig.
+        BadInputError: the options contradict each other, or a file cannot be read.
     """
     plan = _plan(args)
     folders = dict(zip(plan.cameras, args.folders, strict=True))
-    views = read_board_views(folders)
+    views = read_board_views(folders, frame=args.frame)
     if args.range is None and (args.amplitude is not None or args.modulation_mhz is not None):
         raise BadInputError("bad_arguments", "--amplitude and --modulation-mhz are of range images: add --range")
     if args.range is not None:
-        views = add_ranges(views, plan, args.range, args.range_units_per_m, amplitudes=args.amplitude)
-    return solve_rig(views, plan)
+        views = add_ranges(views, plan, args.range, args.range_units_per_m, amplitudes=args.amplitude, frame=args.frame)
+    return views, plan
 
 
 def _plan(args: argparse.Namespace) -> SolvePlan:

@@ -3,12 +3,10 @@
     frame "03":   tof/03.json   left/03.json   ...        one frame = one place of the board, seen by some cameras
     frame "04":   tof/04.json                  ...
 
-Images belong to one frame if the last number in their names is the same (`left03.png`, `right03.png`), or, without a
-number, the whole name.
+Images belong to one frame by their names: `frame_pairing.py` says how.
 """
 
 import hashlib
-import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,6 +17,7 @@ import numpy.typing as npt
 from cairn_calib.board.board import Board, Polarity
 from cairn_calib.board.corner_file import CornerFile, read_corner_file
 from cairn_calib.board.corners import Corners
+from cairn_calib.board.frame_pairing import frames_of, pairing_table, refuse_unpaired
 from cairn_calib.rig.calibration import InputFile
 from cairn_calib.rig.image_files import Grey, read_grey
 from cairn_calib.rig.rig import Spectrum
@@ -85,6 +84,24 @@ class BoardViews:
         """The views of one camera, by frame."""
         return tuple(sorted((view for view in self.views if view.camera == name), key=lambda view: view.frame))
 
+    def refuse_unpaired(self) -> None:
+        """Check that frames connect all cameras that saw the board, and still do without any one of them.
+
+        Raises:
+            BadInputError: they do not.
+        """
+        refuse_unpaired({name: own for name, own in self._frames_by_camera().items() if own}, self._examples())
+
+    def pairing_table(self) -> str:
+        """Lines that show which frames each camera saw, and how many of them two cameras share."""
+        return pairing_table(self._frames_by_camera(), self._examples())
+
+    def _frames_by_camera(self) -> dict[str, list[str]]:
+        return {name: [view.frame for view in self.of_camera(name)] for name in self.cameras}
+
+    def _examples(self) -> dict[str, str]:
+        return {view.camera: f"{view.image} is {view.frame}" for view in reversed(self.views)}
+
     def alone(self, name: str) -> "BoardViews":
         """The views of one camera, as if it were the rig."""
         ranges = tuple(each for each in self.ranges if each.camera == name)
@@ -105,20 +122,14 @@ class BoardViews:
         return replace(self, views=tuple(view for view in self.views if (view.camera, view.frame) not in left_out))
 
 
-def frame_of(name: str) -> str:
-    """The frame that an image belongs to, by its name without suffix."""
-    # Numbers with and without leading zeros name the same frame.
-    numbers = re.findall(r"\d+", name)
-    return numbers[-1].lstrip("0").zfill(6) if numbers else name
-
-
-def read_board_views(folders: Mapping[str, Path]) -> BoardViews:
+def read_board_views(folders: Mapping[str, Path], *, frame: str | None = None) -> BoardViews:
     """The views in folders of corner documents (`cairn calib corners`), by camera name.
 
-    Documents without corners count as inputs, not as views; so do those with fewer than 6.
+    Documents without corners count as inputs, not as views; so do those with fewer than 6. `frame` is the pattern of
+    `frames_of`.
 
     Raises:
-        BadInputError: no documents, two of one frame, of two boards, or of two sizes.
+        BadInputError: no documents, two with corners of one frame, of two boards, or of two sizes.
         DamagedDataError: a document is not of that format.
     """
     sizes: dict[str, tuple[int, int]] = {}
@@ -132,22 +143,23 @@ def read_board_views(folders: Mapping[str, Path]) -> BoardViews:
         inputs += [_input_file(camera, path) for path, _ in documents]
         polarities[camera] = documents[0][1].polarity
         sizes[camera] = _one_size(camera, [document for _, document in documents])
-        frames: dict[str, Path] = {}
-        for path, document in documents:
+        used: dict[str, Path] = {}
+        names = frames_of([path.stem for path, _ in documents], frame)
+        for (path, document), name in zip(documents, names, strict=True):
             boards.setdefault(document.board, path)
-            # One image of a frame for each camera.
-            frame = frame_of(path.stem)
-            if frame in frames:
-                raise BadInputError(
-                    KIND,
-                    f"{frames[frame]} and {path} are of one frame: the last number in their names is the same; name "
-                    "images so that the number counts the places of the board",
-                )
-            frames[frame] = path
             # Images without a board are inputs, but no views.
             corners = document.to_corners()
-            if corners is not None and corners.seen.sum() >= SEEN_MIN:
-                views.append(BoardView(camera, frame, document.image, corners))
+            if corners is None or corners.seen.sum() < SEEN_MIN:
+                continue
+            # One image of a frame for each camera.
+            if name in used:
+                raise BadInputError(
+                    KIND,
+                    f"{used[name]} and {path} are of one frame, {name}: say with --frame REGEX which part of a name "
+                    "counts the places of the board",
+                )
+            used[name] = path
+            views.append(BoardView(camera, name, document.image, corners))
     if len(boards) > 1:
         first, other = list(boards.values())[:2]
         raise BadInputError(KIND, f"{first} and {other} are of two boards: one calibration needs one board")
@@ -177,7 +189,13 @@ def _input_file(camera: str, path: Path) -> InputFile:
 
 
 def add_ranges(
-    views: BoardViews, plan: SolvePlan, folder: Path, units_per_m: float, *, amplitudes: Path | None = None
+    views: BoardViews,
+    plan: SolvePlan,
+    folder: Path,
+    units_per_m: float,
+    *,
+    amplitudes: Path | None = None,
+    frame: str | None = None,
 ) -> BoardViews:
     """Add the 16-bit range images of a folder, of the first range camera, and their amplitude images, to the views.
 
@@ -189,6 +207,7 @@ def add_ranges(
         folder: range images, radial; 0 where nothing came back. They belong to frames as corner images do.
         units_per_m: counts of a range image per metre.
         amplitudes: a folder of images of the same frames; None: the amplitudes are unknown.
+        frame: the pattern of `frames_of`.
 
     Raises:
         BadInputError: there is no range camera, or no image, or one that cannot be read, or two are of one frame.
@@ -197,26 +216,25 @@ def add_ranges(
     owner = next((name for name, camera in plan.cameras.items() if camera.spectrum is Spectrum.RANGE), None)
     if owner is None or not units_per_m > 0:
         raise BadInputError("bad_arguments", "--range needs a camera of spectrum range, and units per metre above 0")
-    bright = {} if amplitudes is None else _by_frame(amplitudes, "amplitude")
+    bright = {} if amplitudes is None else _by_frame(amplitudes, "amplitude", frame)
     inputs: list[InputFile] = []
     ranges = []
-    for frame, path in _by_frame(folder, "range").items():
+    for name, path in _by_frame(folder, "range", frame).items():
         counts = _read(path, "range", inputs)
-        amplitude = _read(bright[frame], "amplitude", inputs).astype(np.uint16) if frame in bright else None
-        ranges.append(RangeView(owner, frame, np.where(counts > 0, counts / units_per_m, np.nan), amplitude))
+        amplitude = _read(bright[name], "amplitude", inputs).astype(np.uint16) if name in bright else None
+        ranges.append(RangeView(owner, name, np.where(counts > 0, counts / units_per_m, np.nan), amplitude))
     return replace(views, ranges=tuple(ranges), inputs=(*views.inputs, *inputs))
 
 
-def _by_frame(folder: Path, what: str) -> dict[str, Path]:
-    paths: dict[str, Path] = {}
-    for path in sorted(folder.glob("*.png")):
-        other = paths.setdefault(frame_of(path.stem), path)
-        if other != path:
-            raise BadInputError(
-                "bad_arguments", f"{other} and {path} are {what} images of one frame: the last number in their names"
-            )
-    if not paths:
+def _by_frame(folder: Path, what: str, frame: str | None) -> dict[str, Path]:
+    images = sorted(folder.glob("*.png"))
+    if not images:
         raise BadInputError("bad_arguments", f"{folder} holds no {what} images (*.png)")
+    paths: dict[str, Path] = {}
+    for path, name in zip(images, frames_of([path.stem for path in images], frame), strict=True):
+        other = paths.setdefault(name, path)
+        if other != path:
+            raise BadInputError("bad_arguments", f"{other} and {path} are {what} images of one frame, {name}")
     return paths
 
 

@@ -116,7 +116,7 @@ def _refuse_parallel(name: str, boards: Floats) -> None:
 def _guess(seen: BoardViews, plan: CameraPlan) -> tuple[Lens, dict[str, Transform]]:
     (name,) = seen.cameras
     size = seen.sizes_px[name]
-    # Views whose corners lie on a line have no homography.
+    # Views whose corners lie on a line have none, and were left out (`solve.py`).
     usable = [(view, H) for view in seen.views if (H := homography_of(view.corners)) is not None]
     _refuse_too_few(name, len(usable))
     K = first_camera_matrix([view.corners for view, _ in usable], [H for _, H in usable], size)

@@ -58,9 +58,10 @@ def rig_start(
 ) -> RigStart:
     """The cameras' places from T_camera_board by camera and frame; `weights` by camera and frame, their corners.
 
+    Frames connect all cameras (`BoardViews.refuse_unpaired`).
+
     Raises:
-        BadInputError: some cameras never saw a board together with the others, or all of a camera's corners are named
-            from the wrong end.
+        BadInputError: all of a camera's corners are named from the wrong end.
     """
     # Readings of each board, as found, then mirrored.
     middle = board.points().mean(axis=0)
@@ -83,8 +84,6 @@ def rig_start(
     edges_to: dict[str, list[_Edge]] = {name: [] for name in names}
     while len(T_rig_camera) < len(names):
         open_edges = [edge for edge in edges if (edge.one in T_rig_camera) != (edge.other in T_rig_camera)]
-        if not open_edges:
-            _refuse_unconnected(names, T_rig_camera)
         best = max(open_edges, key=lambda edge: edge.weight)
         # The edge may lead either way.
         known, new, T = (best.one, best.other, best.T_one_other)
@@ -193,15 +192,6 @@ def _pose_distances(T: Floats, distance_m: float) -> Floats:
     cosine = (R @ R.T - 1) / 2
     shift = np.sqrt(np.sum((t[:, None] - t[None]) ** 2, axis=2))
     return np.asarray(np.arccos(np.clip(cosine, -1, 1)) + shift / distance_m)
-
-
-def _refuse_unconnected(names: Sequence[str], placed: Mapping[str, Transform]) -> None:
-    lost = ", ".join(name for name in names if name not in placed)
-    raise BadInputError(
-        "not_observable",
-        f"no board was seen by {lost} together with {', '.join(placed)}: nothing tells where one is from the other; "
-        "take images of boards that both see at the same time",
-    )
 
 
 def _refuse_reversed(new: str, known: str, edge: _Edge, common: int) -> None:

@@ -37,6 +37,7 @@ from cairn_calib.solve.rig_start import first_state, rig_start
 from cairn_calib.solve.rig_state import RigState, parameter_layout
 from cairn_calib.solve.solution import Solution
 from cairn_calib.solve.solve_plan import Prior, SolvePlan
+from cairn_calib.solve.zhang import homography_of
 from cairn_map.errors import BadInputError
 
 SMOOTH_M = 5e-4
@@ -55,9 +56,12 @@ def solve_rig(views: BoardViews, plan: SolvePlan) -> Solution:
         raise BadInputError(
             "unknown_camera", f"the plan is of {', '.join(plan.cameras)}, the views of {', '.join(views.cameras)}"
         )
+    # Corners on a line leave a board's place open.
+    views = views.without((each.camera, each.frame) for each in views.views if homography_of(each.corners) is None)
     # 1. Each camera alone.
     alone = {name: camera_alone(name, views, plan) for name in plan.cameras}
     # 2. Cameras in the gauge's frame; a view counts by its corners.
+    views.refuse_unpaired()
     weights = {(view.camera, view.frame): float(view.corners.seen.sum()) for view in views.views}
     start = rig_start({name: each.T_camera_board for name, each in alone.items()}, views.board, plan.gauge, weights)
     views = views.without(start.reversed_views)

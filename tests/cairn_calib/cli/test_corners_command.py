@@ -70,7 +70,7 @@ def test_an_image_that_cannot_be_read_is_named_and_the_others_are_done(
     nothing = read_corner_file(out / "bad2.json")
     assert (nothing.attempts[0].stage, nothing.width, nothing.image_sha256) == ("reading", None, None)
     assert {path.name for path in out.glob("*.png")} == {"good1.png"}
-    assert [view.frame for view in read_board_views({"tof": out}).views] == ["000001"]
+    assert [view.frame for view in read_board_views({"tof": out}).views] == ["good-1"]
     for path in (out / "good1.json", out / "tiny3.json"):
         path.unlink()
     with pytest.raises(BadInputError, match="no image of tof could be read"):

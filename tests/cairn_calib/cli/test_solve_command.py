@@ -11,7 +11,7 @@ from tests.fixtures.calib.simulated_views import ranges_of, views_of, world, wri
 
 from cairn_calib.cli.main import main
 from cairn_calib.rig.rig import Spectrum, load_rig
-from cairn_calib.solve.board_views import frame_of, read_board_views
+from cairn_calib.solve.board_views import read_board_views
 from cairn_map.errors import BadInputError
 
 PAIR = ("tof", "left")
@@ -87,10 +87,10 @@ def test_folders_of_corners_become_a_rig_and_a_report(tmp_path: Path, capsys: py
 def test_two_range_images_of_one_frame_are_refused(tmp_path: Path) -> None:
     folders = write_corner_files(views_of(world(3, seed=6, names=PAIR), seed=6), tmp_path)
     (tmp_path / "range").mkdir()
-    for name in ("tof001", "confidence1"):
+    for name in ("tof_001", "tof-001"):
         cv2.imwrite(str(tmp_path / "range" / f"{name}.png"), np.full((144, 176), 1500, np.uint16))
     options = ["--spectrum", "tof=range,left=colour", "--output", str(tmp_path / "rig.json")]
-    with pytest.raises(BadInputError, match=r"confidence1.png and .*tof001.png are range images of one frame"):
+    with pytest.raises(BadInputError, match=r"tof-001.png and .*tof_001.png are range images of one frame"):
         main(["solve", *map(str, folders.values()), *options, "--range", str(tmp_path / "range")])
 
 
@@ -111,11 +111,6 @@ def test_what_belongs_to_range_images_is_not_asked_without_them(tmp_path: Path) 
         main(["solve", *options, "--range", str(tmp_path), "--modulation-mhz", "15"])
 
 
-def test_frames_go_by_the_last_number_in_a_name() -> None:
-    assert frame_of("left03") == frame_of("2026-11-21_tof_3") == "000003"
-    assert frame_of("corner") == "corner"
-
-
 def test_what_does_not_belong_together_is_refused(tmp_path: Path) -> None:
     views = views_of(world(3, seed=6, names=PAIR), seed=6)
     folders = write_corner_files(views, tmp_path)
@@ -124,12 +119,48 @@ def test_what_does_not_belong_together_is_refused(tmp_path: Path) -> None:
         main(["solve", *map(str, folders.values()), "--spectrum", "tof=range", "--output", str(tmp_path / "rig.json")])
     with pytest.raises(BadInputError, match="no corner documents"):
         read_board_views({"tof": tmp_path})
-    extra = folders["tof"] / "again-001.json"
-    extra.write_bytes((folders["tof"] / "tof001.json").read_bytes())
-    with pytest.raises(BadInputError, match="are of one frame"):
+    extra = folders["tof"] / "tof-001.json"
+    document = (folders["tof"] / "tof001.json").read_text()
+    extra.write_text(document)
+    with pytest.raises(BadInputError, match="are of one frame, 001: say with --frame REGEX"):
         read_board_views(folders)
+    # A document without corners collides with none.
+    extra.write_text(json.dumps({**json.loads(document), "corners": []}))
+    assert len(read_board_views(folders).views) == 6
     extra.unlink()
     other = folders["left"] / "left002.json"
     other.write_text(other.read_text().replace('"columns":7', '"columns":8'))
     with pytest.raises(BadInputError, match="are of two boards"):
         read_board_views(folders)
+
+
+def renumber(folder: Path, names: list[str]) -> None:
+    """Give the documents of a folder other names, in their order."""
+    for path, name in zip(sorted(folder.glob("*.json")), names, strict=True):
+        path.rename(path.with_name(f"{name}.json"))
+
+
+def test_images_of_different_moments_are_not_paired(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folders = write_corner_files(views_of(world(6, seed=6, names=PAIR), seed=6), tmp_path)
+    # The same number once, but no moment: 200 of the one and 0200 of the other.
+    renumber(folders["tof"], [f"{n}" for n in range(200, 206)])
+    renumber(folders["left"], [f"{n:04d}" for n in range(200, 206)])
+    options = [*map(str, folders.values()), "--spectrum", "tof=range,left=colour"]
+    options += ["--output", str(tmp_path / "rig.json")]
+    with pytest.raises(BadInputError, match=r"no board was seen by left together with tof.*say with --frame REGEX"):
+        main(["solve", *options])
+    assert "frames that both saw: tof and left 0\n" in capsys.readouterr().out
+    renumber(folders["left"], ["200", "301", "302", "303", "304", "305"])
+    with pytest.raises(BadInputError, match="left and tof saw the board together in one frame alone, 200"):
+        main(["solve", *options])
+    assert not (tmp_path / "rig.json").exists()
+
+
+def test_an_expression_pairs_names_that_differ(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folders = write_corner_files(views_of(world(6, seed=6, names=PAIR), seed=6), tmp_path)
+    renumber(folders["tof"], [f"{n}-of-6" for n in range(1, 7)])
+    renumber(folders["left"], [f"left0{n}" for n in range(1, 7)])
+    options = [*map(str, folders.values()), "--spectrum", "tof=range,left=colour"]
+    options += ["--output", str(tmp_path / "rig.json")]
+    assert main(["solve", *options, "--frame", "0*([1-6])"]) == 0
+    assert "frames that both saw: tof and left 6\n" in capsys.readouterr().out
