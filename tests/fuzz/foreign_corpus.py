@@ -11,7 +11,7 @@ import numpy as np
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as Writer1
-from tests.fixtures.calib.foreign_rigs import KALIBR, ROS
+from tests.fixtures.calib.foreign_rigs import KALIBR, ROS, ROS1_ECHO, ROS2_ECHO
 from tests.fixtures.fusion.bags import ROS1, ROS2, Messages, Timed, optical, png, write_bag
 from tests.fuzz.sections import joined
 
@@ -158,6 +158,8 @@ def _camera_files() -> Iterator[Seed]:
         "mrcal": FORMATS["mrcal"].write([right]),
         "kalibr-foreign": KALIBR,
         "ros-foreign": ROS,
+        "camera_info-1": ROS1_ECHO,
+        "camera_info-2": ROS2_ECHO,
         "kalibr-json": json.dumps(
             {
                 "cam0": {

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from tests.fuzz.sections import in_folder, sections_of
 
-from cairn_calib.exchange.rig_exchange import FORMATS, format_of_text
+from cairn_calib.exchange.rig_exchange import FORMATS, MESSAGE, format_of_text, read_cameras
 from cairn_calib.rig.lidar import SpinningLidar
 from cairn_fusion.clouds.sweep_image import sweep_image
 from cairn_fusion.ros.bag import Wire
@@ -98,6 +98,9 @@ def read_camera_file(data: bytes) -> None:
         text = content.decode(errors="replace")
         with suppress(CairnError):
             format_of_text(Path("left.yaml"), text)
+        if name == MESSAGE:
+            with suppress(CairnError), np.errstate(all="ignore"):
+                read_cameras(Path("left.yaml"), text)
         if name in FORMATS:
             with np.errstate(all="ignore"):
                 _read_twice(name, text)

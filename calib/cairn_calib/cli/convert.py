@@ -7,11 +7,13 @@
     $ cairn calib convert rig.json '{camera}.cameramodel'               # a file for each camera
     $ cairn calib convert left.cameramodel right.cameramodel rig.json --spectrum colour
     $ cairn calib convert rig.json left.yaml --format ros --camera left --drop T_rig_camera
+    $ ros2 topic echo --once /left/camera_info > info.yaml              # read as it is printed
+    $ cairn calib convert info.yaml left.json --spectrum colour
 
 OUT's format follows its suffix (.json: rig.json; .cameramodel: mrcal); to .yaml say --format. What IN is, is found out.
 
     format    a file holds     lenses                                   place of a camera
-    kalibr    all cameras      Brown k1, k2, p1, p2; KB4 fisheye        T_cn_cnm1, from the first camera
+    kalibr    all cameras      Brown k1, k2, p1, p2; KB4 fisheye        T_cn_cnm1 (or T_cam_imu, T_imu_cam)
     opencv    one camera       Brown to 8 coefficients; KB4 fisheye     R, T: rig to camera
     ros       one camera       Brown to 8 coefficients; KB4 fisheye     none
     mrcal     one camera       Brown to 8 coefficients                  extrinsics: rig to camera
@@ -19,6 +21,10 @@ OUT's format follows its suffix (.json: rig.json; .cameramodel: mrcal); to .yaml
 Every number of a lens comes back as it was, places to rounding. A number that the other format cannot say is an error
 that names it; what it may do without (T_rig_camera, sensing, calibration_sigma_px, radiometry, range_bias, body,
 calibration) can be left out by --drop. No format says what spectrum a camera sees: coming back, --spectrum does.
+
+The rig's frame is that of Kalibr's first camera; where the IMU is on the head goes into no rig.json, and is named as
+left out. Lenses of other models (omni, EUCM, double sphere, FOV, splined) are refused by name, with the way out: the
+same images calibrated as a fisheye (equidistant) or as Brown's pinhole.
 """
 
 import argparse
@@ -35,6 +41,7 @@ from cairn_calib.exchange.rig_exchange import (
     cameras_of_rig,
     choose_cameras,
     format_of_text,
+    read_cameras,
     read_text,
     rig_of_cameras,
 )
@@ -93,9 +100,8 @@ def run(args: argparse.Namespace) -> None:
 
 def _read(path: Path, target: str, names: Sequence[str], drop: Sequence[str]) -> CameraFile:
     text = read_text(path)
-    source = format_of_text(path, text)
-    if source != RIG:
-        return FORMATS[source].read(text, name=path.name)
+    if format_of_text(path, text) != RIG:
+        return read_cameras(path, text)
     if target == RIG:
         raise BadInputError("bad_arguments", f"{path.name} is a rig.json already")
     rig = rig_from_json(text.encode())

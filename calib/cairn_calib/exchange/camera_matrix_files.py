@@ -14,6 +14,8 @@ ROS's camera_info YAML (camera_calibration_parsers) has no place on the rig:
     image_width, image_height, camera_name, camera_matrix, distortion_model, distortion_coefficients,
     rectification_matrix, projection_matrix
 
+and so does the message itself as `ros2 topic echo` prints it (`camera_info_message.py`).
+
 `plumb_bob` is Brown's model with five coefficients, `rational_polynomial` with eight, `equidistant` is `fisheye.py`.
 The last two matrices describe the rectified image, which is no matter of the camera: they are written as those of the
 camera alone, and left out on reading.
@@ -26,7 +28,15 @@ from typing import Annotated, Self
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from cairn_calib.exchange.placed_camera import KIND, CameraFile, PlacedCamera, not_held, only_camera, validate
+from cairn_calib.exchange.placed_camera import (
+    KIND,
+    CameraFile,
+    PlacedCamera,
+    foreign_lens,
+    not_held,
+    only_camera,
+    validate,
+)
 from cairn_calib.exchange.yaml_text import numbers, read_yaml
 from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.fisheye import FisheyeCamera
@@ -118,7 +128,10 @@ def read_opencv(text: str, *, name: str) -> CameraFile:
     Raises:
         BadInputError: a field is missing or wrong; the message names it.
     """
-    found = validate(_OpencvCamera, read_yaml(text, name=name), name=name)
+    document = read_yaml(text, name=name)
+    if "xi" in document:
+        raise foreign_lens(name, "omni")  # cv::omnidir
+    found = validate(_OpencvCamera, document, name=name)
     size, is_fisheye = (found.image_width, found.image_height), found.fisheye_model == 1
     lens = lens_of(size, found.camera_matrix, found.distortion_coefficients, fisheye=is_fisheye, name=name)
     T_rig_camera = None
@@ -171,18 +184,23 @@ def read_ros(text: str, *, name: str) -> CameraFile:
         BadInputError: a field is missing or wrong, or of another distortion model; the message names it.
     """
     found = validate(_CameraInfo, read_yaml(text, name=name), name=name)
-    if found.distortion_model not in (*BROWN_MODELS, FISHEYE_MODEL):
-        known = ", ".join((*BROWN_MODELS, FISHEYE_MODEL))
-        raise BadInputError(KIND, f"{name}: distortion_model must be {known}, got {found.distortion_model[:40]!r}")
-    lens = lens_of(
-        (found.image_width, found.image_height),
-        found.camera_matrix,
-        found.distortion_coefficients,
-        fisheye=found.distortion_model == FISHEYE_MODEL,
-        name=name,
+    size = (found.image_width, found.image_height)
+    lens = lens_of_ros(
+        size, found.camera_matrix, found.distortion_coefficients, model=found.distortion_model, name=name
     )
     camera = PlacedCamera(found.camera_name or PurePath(name).stem, lens, None)
     return CameraFile((camera,), tuple(found.model_extra or ()))
+
+
+def lens_of_ros(size: tuple[int, int], K: MatrixNode, D: MatrixNode, *, model: str, name: str) -> Lens:
+    """The camera of ROS's distortion model; an empty name is that of no distortion.
+
+    Raises:
+        BadInputError: another model, or the matrix or the coefficients are not those of one.
+    """
+    if model not in ("", *BROWN_MODELS, FISHEYE_MODEL):
+        raise foreign_lens(f"{name}: distortion_model", model)
+    return lens_of(size, K, D, fisheye=model == FISHEYE_MODEL, name=name)
 
 
 def write_ros(cameras: Sequence[PlacedCamera]) -> str:

@@ -79,3 +79,33 @@ def only_camera(cameras: Sequence[PlacedCamera], *, format_name: str) -> PlacedC
 def not_held(camera: PlacedCamera, field: str, why: str) -> BadInputError:
     """Error to raise where a format cannot hold a number."""
     return BadInputError(KIND, f"cameras.{camera.name}.{field}: {why}")
+
+
+FOREIGN_LENSES = {
+    "omni": "omnidirectional (Mei's unified model)",
+    "ucm": "unified (UCM)",
+    "eucm": "extended unified (EUCM)",
+    "ds": "double sphere",
+    "double_sphere": "double sphere",
+    "fov": "FOV (Devernay and Faugeras)",
+    "field_of_view": "FOV (Devernay and Faugeras)",
+    "thin_prism_fisheye": "fisheye with thin prism",
+}
+"""Lens models that other programs calibrate and rig.json does not hold, by their names in files."""
+
+
+def foreign_lens(name: str, model: str) -> BadInputError:
+    """Error to raise where a file's lens is of a model that no rig holds: its name, and the way out.
+
+    Args:
+        name: the file and camera.
+        model: the model as the file names it.
+    """
+    what = FOREIGN_LENSES.get(model.lower())
+    return BadInputError(
+        KIND,
+        f"{name}: the lens is {what or 'of the model'} ({model[:40]!r} in the file); rig.json holds Brown's pinhole "
+        "(radtan, plumb_bob, rational_polynomial) and Kannala and Brandt's fisheye (equidistant). Calibrate the same "
+        "images with one of these: wide lenses by kalibr_calibrate_cameras --models pinhole-equi, or here by cairn "
+        "calib corners and cairn calib solve --fisheye NAME",
+    )

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import ValidationError
 
+from cairn_calib.exchange.camera_info_message import is_camera_info_message, read_camera_info_messages
 from cairn_calib.exchange.camera_matrix_files import read_opencv, read_ros, write_opencv, write_ros
 from cairn_calib.exchange.kalibr_camchain import read_kalibr, write_kalibr
 from cairn_calib.exchange.mrcal_cameramodel import read_mrcal, write_mrcal
@@ -20,7 +21,8 @@ from cairn_calib.rig.lens import Lens
 from cairn_calib.rig.rig import Rig, Spectrum, mount_camera
 from cairn_map.errors import BadInputError, first_error
 
-RIG = "rig"
+RIG, MESSAGE = "rig", "camera_info"
+"""Forms of a file that are read next to those of `FORMATS`: cairn's own, and ROS's message as it is printed."""
 DROPPABLE = ("T_rig_camera", "sensing", "calibration_sigma_px", "radiometry", "range_bias", "body", "calibration")
 """Fields of a rig that may be left out: none of them changes where a pixel of a camera looks in that camera's frame."""
 
@@ -58,10 +60,12 @@ def format_of_text(path: Path, text: str) -> str:
         return "opencv"
     if re.search(r"^camera_matrix\s*:", text, re.MULTILINE):
         return "ros"
+    if is_camera_info_message(text):
+        return MESSAGE
     raise BadInputError(
         KIND,
-        f"{path.name} is of no known format: expected rig.json, a .cameramodel, or YAML of Kalibr (cam0), OpenCV or "
-        "ROS (camera_matrix)",
+        f"{path.name} is of no known format: expected rig.json, a .cameramodel, or YAML of Kalibr (cam0), OpenCV, "
+        "or ROS (camera_matrix, or camera_info as ros2 topic echo prints it)",
     )
 
 
@@ -79,6 +83,19 @@ def read_text(path: Path) -> str:
         raise BadInputError(KIND, f"cannot read {path}: {exc.strerror}") from exc
     except UnicodeDecodeError as exc:
         raise BadInputError(KIND, f"{path} is no text: {exc.reason} at byte {exc.start}") from exc
+
+
+def read_cameras(path: Path, text: str) -> CameraFile:
+    """The cameras of another program's file, whatever its format.
+
+    Raises:
+        BadInputError: it is of no known format, or something in it is missing or wrong; the message names it.
+    """
+    source = format_of_text(path, text)
+    if source == RIG:
+        raise BadInputError("bad_arguments", f"{path.name} is a rig.json, not another program's file")
+    read = read_camera_info_messages if source == MESSAGE else FORMATS[source].read
+    return read(text, name=path.name)
 
 
 def cameras_of_rig(rig: Rig, *, format_name: str, drop: Sequence[str] = ()) -> CameraFile:
