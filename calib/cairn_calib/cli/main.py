@@ -13,6 +13,7 @@ from importlib.metadata import entry_points
 
 from cairn_calib.cli import check as check_command
 from cairn_calib.cli import convert as convert_command
+from cairn_calib.cli import convert_corners as convert_corners_command
 from cairn_calib.cli import corners as corners_command
 from cairn_calib.cli import report as report_command
 from cairn_calib.cli import solve as solve_command
@@ -20,7 +21,15 @@ from cairn_calib.cli import thermal as thermal_command
 
 # A subcommand is a module with `add_parser(commands)`, which sets `run`, a function of the parsed arguments; or, where
 # it needs recordings or the simulator, one with `main(argv)` behind an entry point of GROUP.
-SUBCOMMANDS = (check_command, convert_command, corners_command, solve_command, report_command, thermal_command)
+SUBCOMMANDS = (
+    check_command,
+    convert_command,
+    convert_corners_command,
+    corners_command,
+    solve_command,
+    report_command,
+    thermal_command,
+)
 GROUP = "cairn.calib"
 ELSEWHERE = {
     "verify": "how well a rig carries circle targets between its cameras",

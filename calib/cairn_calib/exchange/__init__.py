@@ -1,4 +1,5 @@
-"""Rigs in other programs' files: Kalibr, OpenCV, ROS and mrcal.
+"""Rigs and corners in other programs' files: Kalibr, OpenCV, ROS, mrcal and MATLAB.
 
-cairn's own `rig.json` is `rig.rig`'s. Start with `rig_exchange`, which finds the format.
+cairn's own `rig.json` is `rig.rig`'s, its corner documents are `board.corner_file`'s. Start with
+`rig_exchange` and `corner_list`.
 """

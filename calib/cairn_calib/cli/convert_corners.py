@@ -1,0 +1,177 @@
+"""Turn corners that other programs found into corner documents for `cairn calib solve`, and back.
+
+    $ cairn calib convert-corners corners.vnl corners/left --images '*-cam0.jpg' --board 10x10 --square 0.0588
+    corners/left: 46 images, 43 with a board of 10x10 points, from mrcal
+    $ cairn calib convert-corners left.yml corners/left --square 0.025           # OpenCV: image_points
+    $ cairn calib convert-corners left.mat corners/left --square 0.025           # MATLAB: imagePoints, boardSize
+    $ cairn calib convert-corners left.csv corners/left --square 0.025 --size 1280x960
+    $ cairn calib solve corners/left corners/right --spectrum colour --output rig.json
+    $ cairn calib convert-corners corners/left corners/right corners.vnl         # for mrcal; also to .csv
+
+What OUT is decides the way: a folder gets a document for each image of one camera; a .vnl or .csv file gets all images
+of the folders before it.
+
+    IN              a file holds                            noise                      names of images
+    .vnl            filename x y [level or weight]          2^level, or 1 / weight     yes
+    .yml .xml .json OpenCV's calibration sample, -op        the same for all           no: numbered
+    .mat            imagePoints, boardSize; save -v7        the same for all           imageFileNames
+    .csv            image,column,row,x,y[,sigma]            sigma, pixels              yes
+
+Points are in the board's order, row by row (MATLAB's, which go column by column, are turned). `--square` is the edge
+of a cell in metres; `--board` is needed where the file does not say it, for .vnl. How large the images are is taken
+from the file, or from the images themselves, if they are where the file says, or next to it; else say `--size`.
+
+Two cameras belong together by the names of their images. A file without names numbers the images that showed a board:
+two cameras' numbers then agree only if both lists hold the same moments. mrcal-calibrate-cameras reads the written
+.vnl with --corners-cache-has-weights; a table (.csv) keeps the whole covariance.
+"""
+
+import argparse
+import hashlib
+import re
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cairn_calib.board.board import board_size
+from cairn_calib.board.corner_file import CornerFile, read_corner_file
+from cairn_calib.board.corner_pictures import overlay, write_picture
+from cairn_calib.exchange.corner_list import KIND, CornerList, board_of, documents
+from cairn_calib.exchange.corner_table import read_table, write_table
+from cairn_calib.exchange.matlab_corners import read_matlab_points
+from cairn_calib.exchange.mrcal_corners import read_vnl, write_vnl
+from cairn_calib.exchange.opencv_corners import read_opencv_points
+from cairn_calib.rig.image_files import read_bounded, read_grey
+from cairn_map.errors import BadInputError
+
+if TYPE_CHECKING:
+    from argparse import _SubParsersAction
+
+WRITERS = {".vnl": write_vnl, ".csv": write_table}
+OPENCV = (".yml", ".yaml", ".xml", ".json")
+FILE_BYTES_MAX = 256 << 20
+
+
+def add_parser(commands: "_SubParsersAction[argparse.ArgumentParser]") -> None:
+    """Add `convert-corners` to `cairn calib`."""
+    added = commands.add_parser(
+        "convert-corners",
+        help="corners of mrcal, OpenCV and MATLAB as documents for solve, and back",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    added.add_argument("files", nargs="+", type=Path, metavar="IN", help="a file of corners; or folders, to a file")
+    added.add_argument("out", type=Path, metavar="OUT", help="a folder of documents; or a .vnl or .csv file")
+    added.add_argument("--board", metavar="COLUMNSxROWS", help="inner corners, such as 9x6, where IN does not say it")
+    added.add_argument("--square", type=float, metavar="METRES", help="edge of a cell; from disc to disc")
+    added.add_argument(
+        "--pattern", choices=("chessboard", "circles", "asymmetric-circles"), default="chessboard", help="(chessboard)"
+    )
+    added.add_argument("--disc", type=float, metavar="METRES", help="diameter of a disc, for grids of discs")
+    added.add_argument("--size", metavar="WIDTHxHEIGHT", help="of the images, where neither IN nor they say it")
+    added.add_argument("--images", metavar="PATTERN", help="only these, such as '*-cam0.jpg': one camera of several")
+    added.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> None:
+    """Convert, and report what was written on standard output."""
+    if args.out.suffix in WRITERS:
+        _export(args.files, args.out)
+    elif len(args.files) > 1:
+        raise BadInputError(
+            "bad_arguments", f"one file at a time becomes a folder of documents, or OUT is a .vnl or .csv: {args.out}"
+        )
+    else:
+        _import(args)
+
+
+def _import(args: argparse.Namespace) -> None:
+    path: Path = args.files[0]
+    if args.square is None or not 0 < args.square <= 100:
+        raise BadInputError("bad_board", f"--square is an edge in metres, above 0 and at most 100, got {args.square}")
+    size = None if args.board is None else board_size(args.board)
+    listed = _read(path, size)
+    if args.images is not None:
+        listed = listed.matching(args.images)
+    board = board_of(listed, size=size, pitch_m=args.square, pattern=args.pattern, disc_m=args.disc)
+    places = [_image_path(each.name, path) for each in listed.images]
+    stated = None if args.size is None else (None, _size(args.size))
+    # Read one after another: all pictures of a session do not fit into memory.
+    files = [stated if place is None else _digest_and_size(place) for place in places]
+    found = []
+    args.out.mkdir(parents=True, exist_ok=True)
+    for (stem, document), place in zip(documents(listed, board, source=path.name, files=files), places, strict=True):
+        (args.out / f"{stem}.json").write_text(document.model_dump_json(indent=1) + "\n", encoding="utf-8")
+        if place is not None:
+            title = f"{document.image}: {len(document.corners)} of {board.count} corners from {path.name}"
+            write_picture(args.out / f"{stem}.png", overlay(read_grey(place)[0], document.to_corners(), title=title))
+        found.append(bool(document.corners))
+    sys.stdout.write(
+        f"{args.out}: {len(found)} images, {sum(found)} with a board of {board.columns}x{board.rows} points, from "
+        f"{listed.program}\n"
+    )
+    if not listed.is_named:
+        sys.stderr.write(
+            f"{path.name} names no images: they are numbered as they stand in it. Another camera's belong to the same "
+            "moments only if its file lists the same ones\n"
+        )
+
+
+def _read(path: Path, size: tuple[int, int] | None) -> CornerList:
+    data = read_bounded(path, FILE_BYTES_MAX)
+    if path.suffix == ".mat":
+        return read_matlab_points(data, stem=path.stem, name=path.name)
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as exc:
+        raise BadInputError(KIND, f"{path} is no text: {exc.reason} at byte {exc.start}") from exc
+    if path.suffix == ".vnl":
+        return read_vnl(text, name=path.name)
+    if path.suffix == ".csv":
+        return read_table(text, board_size=size, name=path.name)
+    if path.suffix in OPENCV:
+        return read_opencv_points(text, stem=path.stem, name=path.name)
+    raise BadInputError("bad_arguments", f"{path.name} is none of .vnl, {', '.join(OPENCV)}, .mat and .csv")
+
+
+def _image_path(name: str, source: Path) -> Path | None:
+    """The image's file, as the list names it or next to the list; None where it is in neither place."""
+    plain = Path(name.replace("\\", "/"))
+    places = (plain, source.parent / plain, source.parent / plain.name)
+    return next((place for place in places if place.suffix and place.is_file()), None)
+
+
+def _digest_and_size(path: Path) -> tuple[str, tuple[int, int]]:
+    counts, data = read_grey(path)
+    return hashlib.sha256(data).hexdigest(), (counts.shape[1], counts.shape[0])
+
+
+def _size(text: str) -> tuple[int, int]:
+    found = re.fullmatch(r"(\d{1,5})x(\d{1,5})", text)
+    if found is None or not all(1 <= int(side) <= 16384 for side in found.groups()):
+        raise BadInputError("bad_arguments", f"--size is WIDTHxHEIGHT in pixels, such as 1280x960, got {text[:40]!r}")
+    return int(found[1]), int(found[2])
+
+
+def _export(folders: Sequence[Path], out: Path) -> None:
+    found: list[CornerFile] = []
+    for folder in folders:
+        paths = sorted(folder.glob("*.json"))
+        if not paths:
+            raise BadInputError(
+                KIND, f"{folder} holds no corner documents (*.json): make them with cairn calib corners"
+            )
+        for path in paths:
+            document = read_corner_file(path)
+            # Two cameras' images may have the same names: their folders tell them apart.
+            name = f"{folder.resolve().name}/{document.image}" if len(folders) > 1 else document.image
+            found.append(document.model_copy(update={"image": name}))
+    if any(document.board != found[0].board for document in found):
+        raise BadInputError(KIND, "the documents are of several boards: a file of corners holds one")
+    try:
+        out.write_text(WRITERS[out.suffix](found), encoding="utf-8")
+    except OSError as exc:
+        raise BadInputError(KIND, f"cannot write {out}: {exc.strerror}") from exc
+    with_board = sum(bool(document.corners) for document in found)
+    sys.stdout.write(f"{out}: {len(found)} images, {with_board} with a board\n")
