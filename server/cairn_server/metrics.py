@@ -93,10 +93,8 @@ class ServerFigures:
         self.objects_deleted = Counter(
             "cairn_objects_deleted_total", "Objects out of use that were deleted.", registry=self.registry
         )
-        self.settle_failures = Counter(
-            "cairn_settle_failures_total",
-            "Times that the object store did not take or delete what it should.",
-            registry=self.registry,
+        self.settle_failures = self._counter(
+            "cairn_settle_failures_total", "Duties of settling that failed and are tried again, by duty.", "what"
         )
 
     def _counter(self, name: str, help_text: str, *labels: str) -> Bounded[Counter]:

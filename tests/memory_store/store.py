@@ -137,6 +137,11 @@ class MemoryStore:
             kept = state.commits.get(commit)
             return kept.stored() if kept else None
 
+    def kept_sha(self, row: MapRow, commit: CommitId) -> bytes | None:
+        """SHA-256 of a commit whose evidence is kept, folded or not; None if there is none."""
+        found = self.commit(row, commit)
+        return found.sha if found and not found.gone else None
+
     def folded(self, row: MapRow, commit: CommitId) -> StoredCommit | None:
         """A folded commit with its diff, or None."""
         with self._maps.reading(row) as state:

@@ -68,6 +68,7 @@ class BackgroundPlan:
         self._store = _NotingStore(store)
         self._memory = memory
         self._fold: Fold | None = None
+        self._is_away = False
         with store.snapshot(row) as snapshot:
             self._head = snapshot.head
             parts = [part_of(commit, snapshot) for commit in commits if commit.retracts]
@@ -89,7 +90,11 @@ class BackgroundPlan:
 
     def is_failed(self) -> bool:
         """True if something is damaged: the commits are to be folded without a plan, which tells what."""
-        return self.is_done() and self._fold is None
+        return self.is_done() and self._fold is None and not self._is_away
+
+    def is_away(self) -> bool:
+        """True if bytes that it needs are in an object store, which does not answer."""
+        return self.is_done() and self._is_away
 
     def write(self) -> Fold | None:
         """Write the fold on top of the newest state; None if that is not what the plan stands on."""
@@ -116,6 +121,7 @@ class BackgroundPlan:
         # Whatever it is: folding without a plan meets it again, in the thread that can report it.
         with suppress(Exception):
             fold = plan_fold(self._store, self.row, self._head, self.commits, cache)
+            self._is_away = bool(fold.left)
             self._fold = None if fold.damaged or fold.left else fold
         self.seconds = time.monotonic() - start_s
 

@@ -19,12 +19,14 @@ from cairn_server.store.store_rows import CellRow, Head, MapRow
 
 @dataclass(slots=True)
 class CellFaults:
-    """Damaged cells met while one answer was read."""
+    """Cells met while one answer was read that are damaged, or away."""
 
     healed: list[CellRow] = field(default_factory=list)
     """Sound rows of the cells that were rebuilt from the log, to be written back."""
     damaged: set[CellKey] = field(default_factory=set)
     """Cells that could not be rebuilt."""
+    away: int = 0
+    """Count of the cells that are in an object store, which does not answer."""
 
 
 class Cells:

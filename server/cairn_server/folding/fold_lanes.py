@@ -39,6 +39,15 @@ class _Weight(NamedTuple):
     size_bytes: int
 
 
+class PlanOutcome(NamedTuple):
+    """Result of a plan."""
+
+    folded: int = 0
+    """Count of its commits that are folded."""
+    left: tuple[StoredCommit, ...] = ()
+    """Those that wait for bytes in an object store, which does not answer."""
+
+
 class FoldLanes:
     """The lanes of all maps of a store; one thread at a time."""
 
@@ -70,16 +79,18 @@ class FoldLanes:
         if self._plan is not None:
             self._plan.join()
 
-    def write_plan(self, row: MapRow, cache: CellCache, turns: FoldTurns) -> int:
-        """Write the plan of this map if it is done; returns the count of its commits that are folded."""
+    def write_plan(self, row: MapRow, cache: CellCache, turns: FoldTurns) -> PlanOutcome:
+        """Write the plan of this map if it is done."""
         plan, self._costly = self._plan, {}
         if plan is None or plan.row.number != row.number or not plan.is_done():
-            return 0
+            return PlanOutcome()
         self._plan = None
         turns.charge(plan.commits[0].id.author.robot, plan.seconds)
+        if plan.is_away():
+            return PlanOutcome(left=plan.commits)
         if plan.is_failed():
             self._set_aside(plan.commits)
-            return 0
+            return PlanOutcome()
         fold = plan.write()
         if fold is None:
             log.info("map %s: a plan of %d commits does not fit any more", row.name, len(plan.commits))
@@ -88,10 +99,10 @@ class FoldLanes:
             if pieces & self._misfits:
                 self._set_aside(plan.commits)
             self._misfits |= pieces
-            return 0
+            return PlanOutcome()
         cache.moved(fold.base, fold.head, plan.cells)
         self._known_costly.difference_update(commit.number for commit in plan.commits)
-        return len(plan.commits)
+        return PlanOutcome(len(plan.commits))
 
     def cheap(self, row: MapRow, commits: Sequence[StoredCommit], cache: CellCache) -> list[StoredCommit]:
         """Those of a map's pending commits that may be folded now; the costly ones are remembered for `plan_next`."""

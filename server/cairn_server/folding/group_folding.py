@@ -10,7 +10,7 @@ wait, and of a map where very many do, the later commits wait, too.
 import logging
 import time
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from cairn_map.commits.ids import RobotName
@@ -36,8 +36,11 @@ WAITING_MAX = 2048
 """Most commits of a map that wait while later ones of the same robots are folded: 70 kB in each reply's vector."""
 PLAN_SHARE = 0.25
 """Share of the memory for cells under change that plans in the background have."""
-AWAY_S = 5.0
-"""Time after which commits are tried again that wait for bytes in an object store."""
+AWAY_S, AWAY_MAX_S = 5.0, 60.0
+"""Time after which one of the commits is tried again that wait for bytes in an object store, doubled each time that it
+has to wait on, and the longest."""
+HELD_PAGES_MAX = 4
+"""Most pages of pending commits that are read at one look, all of which have to wait behind such commits."""
 PROBE_S = 60.0
 """Time between two attempts to read a damaged cell again while none is reported as healed."""
 
@@ -53,8 +56,14 @@ class Waiting:
     """Count of these commits, by robot."""
     why: DamagedCellError | None = None
     """Error of the cell found last; None: no cell is damaged."""
+    away: set[int] = field(default_factory=set)
+    """Numbers of those of them that need bytes which an object store did not give."""
     away_s: float | None = None
-    """Steady time at which an object store did not give what some of these commits need; None: none needs it."""
+    """Steady time at which it was asked for them last; None: none needs any."""
+    away_wait_s: float = 0.0
+    """Time from then on until it is asked again; 0: `AWAY_S`."""
+    trial: int | None = None
+    """Number of the one that is tried again: all others are not read before it has what it needs."""
     healed: int = 0
     """Count `Damage.healed` at the last look; taken before the look, so that no healing falls between."""
     probed_s: float = 0.0
@@ -70,11 +79,13 @@ class Waiting:
         ready: list[StoredCommit] = []
         for commit in commits:
             robot = commit.id.author.robot
-            waits = self.of_robot[robot]
+            waits, is_trial = self.of_robot[robot], commit.number == self.trial
             is_held = waits >= WAITING_OF_ROBOT_MAX or (waits > 0 and len(self.commits) >= WAITING_MAX)
-            if is_held or _touches(store, row, commit, self.cells):
-                self.commits.add(commit.number)
-                self.of_robot[robot] += 1
+            if (is_held and not is_trial) or _touches(store, row, commit, self.cells):
+                self._wait(commit)
+                if is_trial:  # and tells nothing of the object store: another one is to be tried
+                    self.away.discard(commit.number)
+                    self.trial = None
             else:
                 ready.append(commit)
         return ready
@@ -83,9 +94,29 @@ class Waiting:
         """Leave those of these numbers for later: an object store keeps bytes that they need, and does not answer."""
         for commit in commits:
             if commit.number in numbers:
-                self.commits.add(commit.number)
-                self.of_robot[commit.id.author.robot] += 1
-                self.away_s = time.monotonic()
+                self._wait(commit)
+                self.away.add(commit.number)
+                self.away_s = self.away_s or time.monotonic()
+        if self.trial in numbers:
+            self.away_s, self.away_wait_s = time.monotonic(), min(2 * (self.away_wait_s or AWAY_S), AWAY_MAX_S)
+            self.trial = None
+
+    def end_trial(self, pending: Iterable[int], tried: Collection[int]) -> None:
+        """Try all again if the one that is tried has what it needs: it did not wait on, or is not pending any more."""
+        if self.trial is not None and (self.trial in tried or self.trial not in pending):
+            self._clear()
+
+    def _wait(self, commit: StoredCommit) -> None:
+        self.commits.add(commit.number)
+        if commit.number != self.trial:  # which was counted before
+            self.of_robot[commit.id.author.robot] += 1
+
+    def _clear(self) -> None:
+        """Try all commits again."""
+        self.commits.clear()
+        self.of_robot.clear()
+        self.away.clear()
+        self.away_s, self.away_wait_s, self.trial = None, 0.0, None
 
     def error(self) -> CairnError | None:
         """Error for which commits wait."""
@@ -94,11 +125,17 @@ class Waiting:
         return self.why
 
     def probe(self, store: FoldStore, row: MapRow, damaged: Damage) -> None:
-        """Read the damaged cells again if it is time; if one is sound, everything that waits is tried again."""
-        if self.away_s is not None and time.monotonic() - self.away_s > AWAY_S:
-            self.away_s = None
-            self.commits.clear()
-            self.of_robot.clear()
+        """Read the damaged cells again if it is time; if one is sound, everything that waits is tried again.
+
+        Of what waits for an object store one commit is tried, if it is time.
+        """
+        if self.trial is None and self.away_s is not None:
+            if not self.away:
+                self._clear()
+            elif time.monotonic() - self.away_s > (self.away_wait_s or AWAY_S):
+                self.trial = min(self.away)
+                self.away.discard(self.trial)
+                self.commits.discard(self.trial)
         # The count is taken before the look: a cell healed during it makes the next call look again.
         healed = damaged.healed(row.name)
         if self.cells and (healed != self.healed or time.monotonic() - self.probed_s > PROBE_S):
@@ -108,8 +145,7 @@ class Waiting:
                 damaged.forget(row.name, key)
             if sound:
                 self.cells.clear()
-                self.commits.clear()
-                self.of_robot.clear()
+                self._clear()
                 self.why = None
         self.healed = healed
 
@@ -136,14 +172,25 @@ def fold_around(
         order: of the commits in it; it may leave some for the next group.
     """
     waiting.probe(store, row, damaged)
+    held_pages, tried = 0, set[int]()
+
+    def noted(chosen: Sequence[StoredCommit]) -> Iterator[StoredCommit]:
+        for commit in order(chosen):
+            tried.add(commit.number)
+            yield commit
+
     # Each turn folds, or sets commits or a cell aside, so the loop ends.
     while commits := store.pending(row, limit=limit, size_bytes_max=GROUP_BYTES_MAX, skip=waiting.commits):
         ready = waiting.take(store, row, commits)
         if not ready:
+            held_pages += 1
+            if waiting.away_s is not None and held_pages == HELD_PAGES_MAX:
+                return 0
             continue
         # A cell found damaged only now joins the others, and the rest of the commits is tried without it.
+        tried.clear()
         try:
-            outcome = fold_commits(store, row, cache, ready, order=order)
+            outcome = fold_commits(store, row, cache, ready, order=noted)
         except DamagedCellError as exc:
             if exc.key in waiting.cells:
                 raise
@@ -152,8 +199,10 @@ def fold_around(
             damaged.note(row.name, [exc.key])
             continue
         waiting.leave(ready, outcome.left)
+        waiting.end_trial({commit.number for commit in commits}, tried)
         if outcome.folded or not outcome.left:
             return outcome.folded
+    waiting.end_trial((), tried)
     return 0
 
 
@@ -218,7 +267,8 @@ class LocalFolding:
         cache = self._cache_of(row)
         waiting = self._waiting.setdefault(row.name, Waiting())
         turns, start_s = self._turns.setdefault(row.name, FoldTurns()), time.monotonic()
-        count = self._lanes.write_plan(row, cache, turns)
+        count, left = self._lanes.write_plan(row, cache, turns)
+        waiting.leave(left, [commit.number for commit in left])
 
         def order(commits: Sequence[StoredCommit]) -> Iterator[StoredCommit]:
             return turns.in_turn(self._lanes.cheap(row, commits, cache))

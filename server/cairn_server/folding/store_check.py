@@ -24,6 +24,7 @@ from cairn_map.evidence.fingerprint import ZERO, Fingerprint, fingerprint
 from cairn_map.evidence.grid import CellKey, cell_of_key
 from cairn_map.kernels.morton_kernels import UInts
 from cairn_server.folding.cells_at_rest import decode_stored, rebuilt_cell, stored_evidence
+from cairn_server.store.objects.cold_bytes import AwayError
 from cairn_server.store.store import Snapshot, Store
 from cairn_server.store.store_rows import CellRow, ChainedEntry, MapRow, StoredCommit
 from cairn_server.store.tiles import corners_of, first_and_last_key, tile_of
@@ -65,7 +66,11 @@ class MapCheck:
 
 
 def check_map(store: Store, row: MapRow, report: Report) -> MapCheck:
-    """Check the log, the commits and the cells of one map."""
+    """Check the log, the commits and the cells of one map.
+
+    Raises:
+        AwayError: some of it is in the object store, which does not answer: it is not known to be damaged.
+    """
     checked = MapCheck()
     with store.snapshot(row) as snapshot:
         keys = [cell.key for cell in snapshot.cells()]
@@ -174,6 +179,8 @@ def _of_cell(snapshot: Snapshot, row: MapRow, key: CellKey, known: dict[bytes, F
     name = cell_of_key(key)
     try:
         stored = snapshot.cell(key)
+    except AwayError:
+        raise
     except CairnError as exc:
         yield Finding(row.name, f"cell {name}: {exc.message}")
         return

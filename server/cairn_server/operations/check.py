@@ -27,11 +27,10 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from pydantic import ValidationError
-
-from cairn_map.errors import EXIT_CODES, BadInputError, DamagedDataError, first_error
+from cairn_map.errors import EXIT_CODES, BadInputError, DamagedDataError
 from cairn_map.progress import PercentLine
 from cairn_server.folding.store_check import Finding, check_map
+from cairn_server.operations.bucket_owner import bucket_complaints, settings_of_database
 from cairn_server.operations.store_opening import store_of
 from cairn_server.settings import Settings
 from cairn_server.store.sqlite.archive import SqliteArchive
@@ -85,13 +84,10 @@ def _check_database(url: str, objects: str | None, *, is_repair: bool) -> int:
             "--repair is for a folder; cells of a database are rebuilt by the server that meets them, or healed by "
             "the next robot that has them, and sums come with a restored backup",
         )
-    try:
-        open_store, _ = store_of(Settings(store=url, objects=objects))
-    except ValidationError as exc:
-        raise BadInputError("bad_setting", f"--{first_error(exc)}") from exc
+    open_store, _ = store_of(settings_of_database(url, objects))
     store = open_store()
     try:
-        return _reported(check_all(store))
+        return _reported(check_all(store, bucket_complaints(url, objects), source="objects"))
     finally:
         store.close()
 
@@ -120,9 +116,9 @@ class Outcome:
     summary: str
 
 
-def check_all(store: Store, complaints: Iterable[str] = ()) -> Outcome:
-    """Everything in a store; `complaints` about its file come first."""
-    findings: list[tuple[MapRow | None, Finding]] = [(None, Finding("file", text)) for text in complaints]
+def check_all(store: Store, complaints: Iterable[str] = (), *, source: str = "file") -> Outcome:
+    """Everything in a store; complaints about its file, or another source, come first."""
+    findings: list[tuple[MapRow | None, Finding]] = [(None, Finding(source, text)) for text in complaints]
     progress = PercentLine("check")
     rows = store.maps()
     commits = cells = not_kept = 0

@@ -26,11 +26,12 @@ A field server joins a base with --upstream http://BASE:PORT and a token of role
 operator of one server to count on the other, each needs the other's key: --trust-server KEY (`cairn map ls --json`
 shows it).
 
-Three more commands look after the folder (docs/administrator.md); each explains itself with --help:
+More commands look after the store (docs/administrator.md, docs/scale.md); each explains itself with --help:
 
     cairn serve backup --data DIR FILE      copy the store into one file, while the server runs
     cairn serve restore FILE --data DIR     make a folder out of such a file
     cairn serve check --data DIR            read everything and report what is damaged; --repair heals it
+    cairn serve adopt --store --objects     make a restored database the owner of its bucket
 """
 
 import ctypes
@@ -61,6 +62,7 @@ from cairn_server.http.middleware.work_turns import Lanes
 from cairn_server.http.routes.long_bodies import LongBodies, fork_long_bodies
 from cairn_server.operations import check as check_command
 from cairn_server.operations.backup import back_up_command, restore_command
+from cairn_server.operations.bucket_owner import adopt_command
 from cairn_server.operations.serve_options import serve_parser, settings_of
 from cairn_server.operations.store_opening import settling, store_of
 from cairn_server.operations.upstream import joined
@@ -92,6 +94,7 @@ COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "backup": back_up_command,
     "restore": restore_command,
     "check": check_command.main,
+    "adopt": adopt_command,
 }
 
 

@@ -8,28 +8,36 @@ import logging
 import random
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import TracebackType
 
 from cairn_map.errors import CairnError
 from cairn_map.evidence.grid import cell_of_key
 from cairn_server.metrics import ServerFigures
 from cairn_server.service import Service
+from cairn_server.settings import Settings
 from cairn_server.store.objects.cold_bytes import AwayError
 from cairn_server.store.settling.settler import Moved, Settler
 from cairn_server.store.store_rows import MapRow
 
 log = logging.getLogger(__name__)
 
-LOOK_S = 20.0
-"""Longest time between two looks for bytes at rest; a short rest is looked for as often as it lasts."""
-LIST_EVERY_S = 86_400.0
-"""Time between two listings of all objects, for those that a restored database does not know."""
+LOOK_S, LEAST_LOOK_S = 20.0, 0.2
+"""Longest and shortest time between two looks for bytes at rest: a short rest is looked for as often as it lasts."""
 SCRUB_PER_DAY = 0.01
 """Share of the cold cells that is read in a day to see that they are sound."""
 SCRUB_MAX = 16
 """Most cells that are read at one look."""
+FAILURES_MAX = 8
+"""Failures after which no more maps are settled at one look."""
 LARGEST_WAIT_S = 30.0
 """Longest time between two attempts while they fail."""
+
+
+def look_s_of(settings: Settings) -> float:
+    """Time between two looks for bytes at rest."""
+    return min(LOOK_S, max(LEAST_LOOK_S, settings.settle_cells_s), max(LEAST_LOOK_S, settings.settle_evidence_s))
 
 
 class SettleThread:
@@ -40,7 +48,8 @@ class SettleThread:
         self._service = service
         self._settler = settler
         self._closing = threading.Event()
-        self._list_next_s = time.monotonic() + LIST_EVERY_S
+        self._failures = 0
+        """Count of the duties that failed at this look."""
         self._scrubbed_s = time.monotonic()
         self._due_cells = 0.0
         self._thread = threading.Thread(target=self._run, name="cairn-settle", daemon=True)
@@ -58,51 +67,82 @@ class SettleThread:
         self._settler.close()
 
     def _run(self) -> None:
-        settings = self._service.settings
-        look_s = min(LOOK_S, max(0.2, settings.settle_cells_s), max(0.2, settings.settle_evidence_s))
-        wait_s = look_s
+        look_s = wait_s = look_s_of(self._service.settings)
         while not self._closing.wait(wait_s):
-            try:
-                if self._settler.claim():
-                    self._settle()
-                wait_s = look_s
-            except AwayError as exc:
-                wait_s = min(2 * wait_s, LARGEST_WAIT_S)
-                self._figures.settle_failures.inc()
-                log.error("bytes at rest stay in the database, to be tried again: %s", exc.message)
-            except Exception as exc:
-                # Whatever it is, this thread must live: there is no other one.
-                wait_s = min(2 * wait_s, LARGEST_WAIT_S)
-                log.error("settling failed: %s", exc, exc_info=None if isinstance(exc, CairnError) else exc)
+            self._failures = 0
+            self.look()
+            wait_s = min(2 * wait_s, LARGEST_WAIT_S) if self._failures else look_s
 
     @property
     def _figures(self) -> ServerFigures:
         return self._service.figures
 
-    def _settle(self) -> None:
-        settings, store = self._service.settings, self._service.store
-        now_s = store.age.now_s()
-        for row in self._settler.maps_at_rest(evidence_before_s=now_s - settings.settle_evidence_s):
-            with store.snapshot(row) as snapshot:
-                to_seq = snapshot.seq_before(now_s - settings.settle_cells_s)
-            steps = (
-                ("cells", self._settler.settle_cells(row, to_seq=to_seq, age_s=now_s)),
-                (
-                    "evidence",
-                    self._settler.settle_evidence(row, before_s=now_s - settings.settle_evidence_s, age_s=now_s),
-                ),
-            )
-            for kind, moves in steps:
-                for moved in moves:
-                    self._note(row, kind, moved)
-                    if self._closing.is_set() or not self._settler.claim():
+    def look(self) -> None:
+        """Do once what is to be done, if this server is the one that does it."""
+        if not self._goes_on():
+            return
+        settings, now_s = self._service.settings, self._service.store.age.now_s()
+        rows: list[MapRow] = []
+        with self._duty("look"):
+            rows = self._settler.maps_at_rest(evidence_before_s=now_s - settings.settle_evidence_s)
+        # In another order each time, so that maps that fail keep no other one from its turn for ever.
+        random.shuffle(rows)
+        for row in rows:
+            with self._duty("cells", row):
+                self._settle_cells(row, now_s)
+            if not self._settler.is_away:
+                with self._duty("evidence", row):
+                    before_s = now_s - settings.settle_evidence_s
+                    self._take(row, "evidence", self._settler.settle_evidence(row, before_s=before_s, age_s=now_s))
+            # A failure of all maps is not found out map by map.
+            if self._settler.is_away or not self._goes_on():
+                return
+            if self._failures >= FAILURES_MAX:
+                break
+        with self._duty("delete"):
+            while deleted := self._settler.delete_dead(before_s=now_s - settings.objects_grace_s):
+                self._figures.objects_deleted.inc(deleted)
+                if not self._goes_on():
+                    return
+        with self._duty("list"):
+            if self._settler.is_listing_due(age_s=now_s):
+                for _ in self._settler.note_unknown(age_s=now_s):
+                    if not self._goes_on():
                         return
-        deleted = self._settler.delete_dead(before_s=now_s - settings.objects_grace_s)
-        self._figures.objects_deleted.inc(deleted)
-        if time.monotonic() > self._list_next_s:
-            self._list_next_s = time.monotonic() + LIST_EVERY_S
-            self._settler.note_unknown(age_s=now_s)
-        self._scrub()
+        with self._duty("scrub"):
+            self._scrub()
+
+    def _goes_on(self) -> bool:
+        """True if this server is still the one that settles, and not about to end."""
+        may_work = False
+        if not self._closing.is_set():
+            with self._duty("own"):
+                may_work = self._settler.may_work()
+        return may_work
+
+    @contextmanager
+    def _duty(self, what: str, row: MapRow | None = None) -> Iterator[None]:
+        """A duty whose failure is counted and logged, and stops no other one."""
+        try:
+            yield
+        except Exception as exc:
+            # Whatever it is, this thread must live: there is no other one.
+            self._failures += 1
+            self._figures.settle_failures.labels(what).inc()
+            place = "" if row is None else f"map {row.name}: "
+            trace = None if isinstance(exc, CairnError) else exc
+            log.error("%ssettling (%s) failed, to be tried again: %s", place, what, exc, exc_info=trace)
+
+    def _settle_cells(self, row: MapRow, now_s: float) -> None:
+        with self._service.store.snapshot(row) as snapshot:
+            to_seq = snapshot.seq_before(now_s - self._service.settings.settle_cells_s)
+        self._take(row, "cells", self._settler.settle_cells(row, to_seq=to_seq, age_s=now_s))
+
+    def _take(self, row: MapRow, kind: str, moves: Iterator[Moved]) -> None:
+        for moved in moves:
+            self._note(row, kind, moved)
+            if not self._goes_on():
+                return
 
     def _note(self, row: MapRow, kind: str, moved: Moved) -> None:
         self._figures.settled_bytes.labels(kind).inc(moved.size_bytes)

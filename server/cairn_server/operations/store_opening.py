@@ -68,13 +68,14 @@ def settling(service: Service) -> AbstractContextManager[object]:
     settings = service.settings
     if settings.store is None or settings.objects is None or settings.folding == "elsewhere":
         return nullcontext()
-    from cairn_server.operations.settle_thread import SettleThread
+    from cairn_server.operations.settle_thread import SettleThread, look_s_of
     from cairn_server.store.objects.bucket import open_bucket
     from cairn_server.store.postgres.connections import Connections
     from cairn_server.store.settling.settler import Settler
 
     connections = Connections(settings.store, limit=SETTLE_CONNECTIONS)
-    return SettleThread(service, Settler(connections, open_bucket(settings.objects), holder=secrets.token_hex(8)))
+    bucket, holder = open_bucket(settings.objects), secrets.token_hex(8)
+    return SettleThread(service, Settler(connections, bucket, holder=holder, turn_s=look_s_of(settings)))
 
 
 def _not_installed(flag: str, package: str, extra: str) -> BadInputError:

@@ -460,12 +460,16 @@ class Store(Protocol):
         """Commits to be folded, in turn of their robots, with their diffs: at most `limit`, and one or within the size.
 
         First the oldest of each robot, then the second of each; none whose number is in `skip`. Folded ones whose
-        retract is under way (`StoredCommit.due_from`) are among them.
+        retract is under way (`StoredCommit.due_from`) are among them, perhaps without their diffs.
         """
         ...
 
     def commit(self, row: MapRow, commit: CommitId) -> StoredCommit | None:
         """A commit with its diff, folded or not; None if there is none."""
+        ...
+
+    def kept_sha(self, row: MapRow, commit: CommitId) -> bytes | None:
+        """SHA-256 of a commit whose evidence is kept, folded or not; None if there is none. No evidence is read."""
         ...
 
     def folded(self, row: MapRow, commit: CommitId) -> StoredCommit | None:

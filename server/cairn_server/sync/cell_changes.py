@@ -17,6 +17,7 @@ from cairn_map.wire.frames import CellFrame, FrameKind
 from cairn_server.cell_room import DECODING, changed_bytes
 from cairn_server.folding.cells_at_rest import sum_of_contributions
 from cairn_server.folding.read_cache import Change, ChangeName, ReadCache, state_of
+from cairn_server.store.objects.cold_bytes import AwayError
 from cairn_server.store.stamps import blocks_after
 from cairn_server.store.store import Snapshot
 from cairn_server.store.store_rows import CellRow, Contribution
@@ -110,12 +111,15 @@ def _smallest(
 
 
 def _delta(snapshot: Snapshot, row: CellRow, foreign: list[Contribution], geometry: Geometry) -> bytes | None:
-    """Encoded sum of what others did to a cell; None if it would be too large, or a diff is damaged."""
+    """Encoded sum of what others did to a cell; None if it would be too large, or a diff is damaged or away."""
     # Diffs that together have four times the cell's bytes hardly sum up to less than the cell.
     if sum(entry.size_bytes for entry in foreign) > 4 * row.size_bytes:
         return None
     if len(foreign) == 1 and foreign[0].kind == ENTRY_FOLD:
-        return snapshot.diff(foreign[0].commit, row.key)  # one commit's diff is its own sum
+        try:
+            return snapshot.diff(foreign[0].commit, row.key) or None  # its own sum; empty: its segment is lost
+        except AwayError:
+            return None
     # Of several commits: decoded and added up, one cell at a time in the room that all requests share.
     size_bytes = changed_bytes(geometry, row.voxels)
     if size_bytes > DECODING.limit_bytes:
@@ -124,6 +128,8 @@ def _delta(snapshot: Snapshot, row: CellRow, foreign: list[Contribution], geomet
         with DECODING.of(size_bytes):
             evidence = sum_of_contributions(snapshot, row.key, foreign, geometry).packed()
             return encode_cell(row.key, evidence, geometry).data if len(evidence) else b""
+    except AwayError:
+        return None
     except DamagedDataError as exc:
         log.error("cell %s: a diff at rest is damaged, sending the whole cell: %s", cell_of_key(row.key), exc.message)
         return None
@@ -132,7 +138,7 @@ def _delta(snapshot: Snapshot, row: CellRow, foreign: list[Contribution], geomet
 def _state(
     snapshot: Snapshot, row: CellRow, after_seq: int, geometry: Geometry, cache: ReadCache, *, size_bytes_max: int
 ) -> Change | None:
-    """Frame of the changed blocks' present sums, if it can have less than `size_bytes_max`."""
+    """Frame of the changed blocks' present sums, if it can have less than `size_bytes_max` and the cell is here."""
     try:
         # Estimate from the stamps alone whether it can be small enough, before the cell is decoded.
         stamps = cache.stamps(snapshot, row, geometry)
@@ -144,6 +150,8 @@ def _state(
         # Last, since it is expensive. All take room before they ask the cache: its maker has it, too.
         with DECODING.of_cell(geometry, row.voxels):
             changed = of_blocks(cache.evidence(snapshot, row), blocks)
+    except AwayError:
+        return None
     except DamagedDataError as exc:
         log.error("cell %s: %s; no changed blocks of it", cell_of_key(row.key), exc.message)
         return None

@@ -189,7 +189,7 @@ class CellFrames:
     geometry: Geometry
     cache: ReadCache
     faults: CellFaults
-    """Damaged cells met on the way; filled here."""
+    """Cells met on the way that are damaged, or away; filled here."""
 
     def frame_of(self, row: CellRow, start: Cursor | None) -> CellFrame | None:
         """Smallest frame that brings a cell from the asker's state `start` to this one; None: it has that state."""
@@ -202,7 +202,10 @@ class CellFrames:
         try:
             return self._bytes_of(row, start)
         except AwayError as exc:
-            log.warning("cell %s is sent without its bytes: %s", cell_of_key(row.key), exc.message)
+            if not self.faults.away:  # once a reply: thousands may be away
+                name = cell_of_key(row.key)
+                log.warning("cell %s is sent without its bytes, and others may be: %s", name, exc.message)
+            self.faults.away += 1
             return self._frame(FrameKind.FULL, row.key, start, row.fingerprint)
 
     def _bytes_of(self, row: CellRow, start: Cursor | None) -> CellFrame:

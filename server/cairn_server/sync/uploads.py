@@ -71,9 +71,9 @@ class Uploads:
             DeniedError: kind `not_allowed`: it is another robot's.
         """
         commit, robot = uploaded_by(caller, id_text)
-        kept = self._store.commit(row, commit)
+        sha = self._store.kept_sha(row, commit)
         size_bytes = self._size(BodyPlace(row.number, robot, commit), digest)
-        return Upload(size_bytes=size_bytes, sha=kept.sha.hex() if kept and not kept.gone else None)
+        return Upload(size_bytes=size_bytes, sha=sha.hex() if sha else None)
 
     def add(
         self, row: MapRow, caller: Caller, id_text: str, part: BodyPart, *, signatures: str | None = None
@@ -112,8 +112,8 @@ class Uploads:
             self._bodies.drop(place)
             raise
         self._bodies.drop(place)
-        kept = self._store.commit(row, commit)
-        return Upload(size_bytes=len(whole), sha=kept.sha.hex() if kept else None), is_new
+        sha = self._store.kept_sha(row, commit)
+        return Upload(size_bytes=len(whole), sha=sha.hex() if sha else None), is_new
 
     def staged_bytes(self) -> int:
         """Bytes held."""

@@ -17,6 +17,7 @@ from cairn_map.errors import CairnError, DamagedDataError
 from cairn_map.evidence.grid import CellKey, cell_key, cell_of_key
 from cairn_server.live.fold_news import FoldNews
 from cairn_server.store.history import is_proven
+from cairn_server.store.objects.cold_bytes import AwayError
 from cairn_server.store.store import Store
 from cairn_server.store.store_rows import MapRow
 from cairn_server.views.cell_views import ViewCache, first_depth, view_name, view_of_stored
@@ -111,5 +112,5 @@ class ViewPrefetch:
                 stored = snapshot.cell(key)
             if stored is not None:
                 self._views.view(view_name(row, stored, depth), lambda: view_of_stored(row, stored, depth))
-        except DamagedDataError as exc:
-            log.info("%s; it may be rebuilt when a client asks for it", exc.message)
+        except (DamagedDataError, AwayError) as exc:
+            log.info("no view of cell %s before a client asks for it: %s", cell_of_key(key), exc.message)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
-from tests.fixtures.map.made import SMALL
+from tests.fixtures.map.made import SMALL, random_evidence
 from tests.fixtures.server.commit_contract import folded_map
 from tests.fixtures.server.crowd_contract import all_at_once
 from tests.fixtures.server.evidence_contract import SOON, cells_of, fold, kept_bytes
@@ -16,13 +16,13 @@ from tests.fixtures.server.pushes import KEYS, WREN, pushed
 from tests.fixtures.server.settled_store import PLACE, ColdStore, SwitchedBucket, drain
 
 from cairn_map.errors import BadInputError, UnreachableError
-from cairn_map.evidence.grid import CellKey
+from cairn_map.evidence.grid import Cell, CellKey, cell_key
 from cairn_server.folding.cells_at_rest import sound_cell
 from cairn_server.settings import Settings
 from cairn_server.store.objects.bucket import Bucket, open_bucket
 from cairn_server.store.objects.cold_bytes import MARK, AwayError
 from cairn_server.store.postgres.connections import Connection, Connections
-from cairn_server.store.postgres.schema import BOUND_OLDEST
+from cairn_server.store.postgres.schema import BOUND_OLDEST, STEPS
 from cairn_server.store.postgres.store import PgStore
 from cairn_server.store.settling.settler import Settler
 from cairn_server.store.store_rows import CellRow, MapRow
@@ -153,6 +153,25 @@ def test_a_large_map_moves_in_several_steps(
     assert len([name for name in store.bucket.objects() if name.startswith("segments/")]) == len(COMMITS)
 
 
+def test_a_stop_costs_the_tiles_under_way_and_not_all_that_moved(
+    store: ColdStore, database: Database, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cairn_server.store.settling.settler.TILES_AT_ONCE", 1)
+    row = folded_map(store, pushed(0, 0))
+    for n in range(1, 4):
+        fold(store, row, pushed(n, n, cells={cell_key(Cell(40 * n, 0, 0)): random_evidence(n, SMALL, voxels=2)}))
+    with store.snapshot(row) as snapshot:
+        to_seq = snapshot.head.seq
+    moves = store.settler.settle_cells(row, to_seq=to_seq, age_s=0.0)
+    for _ in range(3):
+        next(moves)
+    ((mark,),) = database.execute("SELECT seq FROM settled")
+    assert 0 < int(str(mark)) < to_seq
+    drain(store.settler.settle_cells(row, to_seq=to_seq, age_s=0.0))
+    assert database.execute("SELECT count(body) FROM cell") == [(0,)]
+    assert database.execute("SELECT seq FROM settled") == [(to_seq,)]
+
+
 # Kills and races
 
 
@@ -234,6 +253,9 @@ def test_a_kill_at_any_step_loses_nothing_and_leaves_no_object_that_is_not_noted
         if kills % 3 == 0:
             fold(store, row, pushed(kills, kills))
             expected = contents(store, row)
+        if kills % 24 == 0:
+            # Or each kill would leave more to be deleted than the next one takes steps.
+            store.settler.delete_dead(before_s=SOON)
     assert kills > 20
     store.settler.delete_dead(before_s=SOON)
     assert store.bucket.objects() == named(database)
@@ -260,6 +282,12 @@ def test_one_settler_works_at_a_time(store: ColdStore, database: Database) -> No
         assert not store.settler.claim()
         other.release()
         assert store.settler.claim()
+
+
+def test_a_program_that_is_too_old_for_its_database_settles_no_more(store: ColdStore, database: Database) -> None:
+    assert store.settler.claim()
+    database.execute(f"UPDATE cairn_schema SET oldest = {len(STEPS) + 1}")
+    assert not store.settler.claim()
 
 
 class PausedBucket(SwitchedBucket):
@@ -299,7 +327,7 @@ def test_a_settler_that_slept_longer_than_the_grace_names_no_object_that_is_dele
         assert contents(store, row) == before
         # What was put after its note was gone is found by the listing.
         bucket.meanwhile = lambda: None
-        store.settler.note_unknown(age_s=0.0)
+        drain(store.settler.note_unknown(age_s=0.0))
         store.settler.delete_dead(before_s=SOON)
         assert not bucket.objects()
 
@@ -347,8 +375,8 @@ def test_objects_that_a_restored_database_does_not_know_are_deleted_in_time(
     store.bucket.put(f"cells/{row.number}/5/1.{'0' * 64}.0000000000000000", b"later")
     store.bucket.put(f"segments/{row.number}/{'0' * 32}", b"later")
     store.bucket.put("cells/of another program", b"not ours")
-    assert store.settler.note_unknown(age_s=10.0) == 2
-    assert store.settler.note_unknown(age_s=99.0) == 0
+    assert sum(store.settler.note_unknown(age_s=10.0)) == 2
+    assert sum(store.settler.note_unknown(age_s=99.0)) == 0
     assert store.settler.delete_dead(before_s=10.0) == 0
     assert store.settler.delete_dead(before_s=11.0) == 2
     assert store.bucket.objects() == {*known, "cells/of another program"}

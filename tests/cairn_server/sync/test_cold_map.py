@@ -1,6 +1,7 @@
 """A map of which bytes are in an object store, which is away at times: what needs them waits, all else goes on."""
 
-from collections.abc import Iterator
+import hashlib
+from collections.abc import Collection, Iterator
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,11 +10,13 @@ import pytest
 from tests.fixtures.map.made import SMALL, random_evidence
 from tests.fixtures.server.answers import kind_of
 from tests.fixtures.server.commit_contract import folded_map
+from tests.fixtures.server.evidence_contract import SOON
 from tests.fixtures.server.fetching import ask_missing, fetch
 from tests.fixtures.server.live import Live, until
 from tests.fixtures.server.postgres import PostgresServer, new_database
 from tests.fixtures.server.pushes import KEYS, MOLE, WREN, pushed, read, sum_of
-from tests.fixtures.server.settled_store import ColdStore, SwitchedBucket
+from tests.fixtures.server.settled_store import ColdStore, SwitchedBucket, drain
+from tests.fixtures.server.store_contract import new_of
 from tests.naive.asker import NaiveAsker, cell_frames
 
 from cairn_map.commits.commit import Commit
@@ -21,7 +24,14 @@ from cairn_map.commits.ids import Author, Incarnation, RobotName
 from cairn_map.evidence.grid import Cell, CellKey, cell_key, cell_of_key
 from cairn_map.wire.frames import FrameKind, frames_of
 from cairn_map.wire.messages import ReplyHeader
-from cairn_server.store.store_rows import MapRow
+from cairn_server.folding.cell_cache import CellCache
+from cairn_server.folding.damaged_cells import DamagedCells
+from cairn_server.folding.group_folding import AWAY_MAX_S, AWAY_S, LocalFolding, Waiting, fold_around
+from cairn_server.folding.store_check import check_map
+from cairn_server.store.objects.cold_bytes import AwayError
+from cairn_server.store.store_rows import MapRow, StoredCommit
+from cairn_server.views.cell_views import first_depth, view_name
+from cairn_server.views.view_prefetch import ViewPrefetch
 
 pytestmark = [pytest.mark.processes, pytest.mark.slow]
 
@@ -144,6 +154,174 @@ def test_an_asker_gets_the_other_cells_and_this_one_later(cold: Cold, bucket: Sw
     asker = NaiveAsker(MOLE)
     fetch(live, row, asker)
     assert asker.map() == sum_of([cold.first, hot])
+
+
+def test_a_hot_cell_of_cold_evidence_comes_whole(cold: Cold, bucket: SwitchedBucket) -> None:
+    live, row = cold.live, cold.row
+    asker = NaiveAsker(MOLE)
+    fetch(live, row, asker)
+    more = [evidence_in(KEYS[0], n=n) for n in (1, 2)]
+    for commit in more:
+        live.push(row, commit)
+        until(lambda commit=commit: not is_waiting(live, row, commit), "it is folded")
+    drain(cold.store.settler.settle_evidence(row, before_s=SOON, age_s=0.0))
+    bucket.is_away = True
+    fetch(live, row, asker)
+    assert asker.map() == sum_of([cold.first, *more])
+
+
+def test_a_delta_of_which_the_segment_is_lost_is_sent_as_the_whole_cell(cold: Cold, bucket: SwitchedBucket) -> None:
+    live, row = cold.live, cold.row
+    asker = NaiveAsker(MOLE)
+    fetch(live, row, asker)
+    more = evidence_in(KEYS[0], n=1)
+    live.push(row, more)
+    until(lambda: not is_waiting(live, row, more), "it is folded")
+    drain(cold.store.settler.settle_evidence(row, before_s=SOON, age_s=0.0))
+    for name in bucket.objects():
+        if name.startswith("segments/"):
+            bucket.delete(name)
+    fetch(live, row, asker)
+    assert asker.map() == sum_of([cold.first, more])
+
+
+def test_a_reply_of_cells_that_are_away_is_one_line_in_the_log(
+    cold: Cold, bucket: SwitchedBucket, caplog: pytest.LogCaptureFixture
+) -> None:
+    live, row = cold.live, cold.row
+    more = evidence_in(*KEYS, n=1)
+    live.push(row, more)
+    until(lambda: not is_waiting(live, row, more), "it is folded")
+    cold.store.settle(row)
+    bucket.is_away = True
+    frames = frames_of(ask_missing(live, row, NaiveAsker(MOLE).request()).content)
+    assert len(cell_frames(frames)) == len(KEYS)
+    assert caplog.text.count("is sent without its bytes") == 1
+
+
+def test_a_check_of_a_store_that_is_away_is_no_finding(cold: Cold, bucket: SwitchedBucket) -> None:
+    hot = evidence_in(FAR, n=1)
+    cold.live.push(cold.row, hot)
+    until(lambda: not is_waiting(cold.live, cold.row, hot), "it is folded")
+    bucket.is_away = True
+    with pytest.raises(AwayError):
+        check_map(cold.store, cold.row, lambda done, total: None)
+
+
+def test_the_state_of_an_upload_is_known_without_its_evidence(cold: Cold, bucket: SwitchedBucket) -> None:
+    bucket.is_away = True
+    path = f"/maps/{cold.row.name}/commits/{cold.first.id}/upload"
+    answer = cold.live.http.get(path, params={"digest": hashlib.sha256(cold.first.data).hexdigest()})
+    assert (answer.status_code, answer.json()["sha"]) == (200, cold.first.sha.hex())
+
+
+def test_views_of_hot_cells_are_made_ahead_while_others_are_away(cold: Cold, bucket: SwitchedBucket) -> None:
+    live, row = cold.live, cold.row
+    hot = evidence_in(FAR, n=1)
+    live.push(row, hot)
+    until(lambda: not is_waiting(live, row, hot), "it is folded")
+    bucket.is_away = True
+    depth, views = first_depth(row.geometry.depth), live.service.views.cells.cache
+    with live.service.store.snapshot(row) as snapshot:
+        (cell,) = snapshot.cells_of([FAR])
+    with closing(ViewPrefetch(live.service.store, views, live.service.fold_news, look_every_s=0.01)):
+        until(lambda: views.has(view_name(row, cell, depth)), "the view is made")
+
+
+def test_a_retract_under_way_is_pending_without_its_own_cold_evidence(
+    cold: Cold, bucket: SwitchedBucket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cairn_server.folding.commit_work.PART_NAMES_MAX", 1)
+    live, row = cold.live, cold.row
+    targets = [evidence_in(FAR, n=1), evidence_in(KEYS[0], n=2)]
+    for commit in targets:
+        live.push(row, commit)
+    until(lambda: not is_waiting(live, row, *targets), "they are folded")
+    cold.store.settle(row)
+    bucket.is_away = True
+    cells = {cell_key(Cell(80, 0, 0)): random_evidence(3, SMALL, voxels=6)}
+    retract = pushed(3, 3, WREN, retracts=reversed(targets), cells=cells)
+    live.push(row, retract)
+    until(lambda: not is_waiting(live, row, retract), "its own evidence is folded")
+    bucket.is_away = False
+    drain(cold.store.settler.settle_evidence(row, before_s=SOON, age_s=0.0))
+    bucket.is_away = True
+    (pending,) = cold.store.pending(row, limit=9, size_bytes_max=1 << 20)
+    assert (pending.id, pending.diff) == (retract.id, {})
+
+
+class CountingStore(ColdStore):
+    """A store that counts the commits that are read to be folded."""
+
+    count = 0
+
+    def pending(
+        self, row: MapRow, *, limit: int, size_bytes_max: int, skip: Collection[int] = ()
+    ) -> list[StoredCommit]:
+        """As a store does."""
+        found = super().pending(row, limit=limit, size_bytes_max=size_bytes_max, skip=skip)
+        self.count += len(found)
+        return found
+
+
+def test_of_all_commits_that_wait_one_is_read_again_until_the_store_is_back(
+    newest_postgres: PostgresServer, bucket: SwitchedBucket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cairn_server.folding.group_folding.AWAY_S", 1e-9)
+    with closing(CountingStore(new_database(newest_postgres).url, bucket)) as store:
+        row = folded_map(store, evidence_in(KEYS[0], n=0))
+        store.settle(row)
+        bucket.is_away = True
+        waits = [evidence_in(KEYS[0], n=n) for n in range(1, 9)]
+        for commit in waits:
+            store.append(row, new_of(commit))
+        folding, store.count = LocalFolding(store, DamagedCells()), 0
+        assert folding.fold(row).commits == 0
+        assert store.count == len(waits)
+        for turn in range(1, 5):
+            assert isinstance(folding.fold(row).waits_for, AwayError)
+            assert store.count == len(waits) + turn
+        bucket.is_away = False
+        assert folding.fold(row).commits == 1
+        again = folding.fold(row)
+        assert (again.commits, again.waits_for) == (len(waits) - 1, None)
+        folding.close()
+
+
+def test_the_time_until_the_next_attempt_doubles_up_to_a_bound(
+    newest_postgres: PostgresServer, bucket: SwitchedBucket
+) -> None:
+    with closing(ColdStore(new_database(newest_postgres).url, bucket)) as store:
+        row = folded_map(store, evidence_in(KEYS[0], n=0))
+        store.settle(row)
+        bucket.is_away = True
+        store.append(row, new_of(evidence_in(KEYS[0], n=1)))
+        waiting, cache, damaged, waits_s = Waiting(), CellCache(row.geometry), DamagedCells(), []
+        for _ in range(6):
+            assert fold_around(store, row, cache, waiting, damaged, limit=9) == 0
+            assert waiting.away_s is not None
+            waits_s.append(waiting.away_wait_s)
+            waiting.away_s -= AWAY_MAX_S + 1
+    assert waits_s == [0.0, 2 * AWAY_S, 4 * AWAY_S, 8 * AWAY_S, AWAY_MAX_S, AWAY_MAX_S]
+
+
+def test_a_plan_whose_bytes_are_away_waits_and_is_planned_again(
+    newest_postgres: PostgresServer, bucket: SwitchedBucket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cairn_server.folding.group_folding.AWAY_S", 1e-9)
+    monkeypatch.setattr("cairn_server.folding.fold_lanes.slice_s", lambda size_bytes: -1.0)
+    with closing(ColdStore(new_database(newest_postgres).url, bucket)) as store:
+        row = folded_map(store, pushed(0, 0), pushed(0, 0, WREN))
+        drain(store.settler.settle_evidence(row, before_s=SOON, age_s=0.0))
+        bucket.is_away = True
+        retract = pushed(1, 1, WREN, retracts=[pushed(0, 0)])
+        store.append(row, new_of(retract))
+        folding = LocalFolding(store, DamagedCells())
+        until(lambda: isinstance(folding.fold(row).waits_for, AwayError), "the plan waits")
+        bucket.is_away = False
+        until(lambda: folding.fold(row).commits > 0, "it is folded")
+        assert folding._lanes._unplanned == set()
+        folding.close()
 
 
 def test_robots_that_come_now_and_then_end_with_the_map_though_all_of_it_is_cold(cold: Cold) -> None:

@@ -16,7 +16,9 @@ from cairn_map.errors import UnreachableError
 HEAD = struct.Struct("<Q")
 """Head of a cell's object: size of its bytes, which come before its stamps."""
 MARK = "cairn-store"
-"""Object that says which database's bytes are next to it."""
+"""Object that says which store's bytes are next to it."""
+OWNER = "cairn-owner"
+"""Object that says which database of this store works on them."""
 NONCE_BYTES = 8
 RETRY_S = 5.0
 """Seconds after which a client may ask again for what an object store did not give."""

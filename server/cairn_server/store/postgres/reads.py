@@ -77,19 +77,31 @@ class PgReads:
         )
         values = {"map": row.number, "skip": sorted(skip), "limit": limit}
         with self._connections.snapshot() as connection:
-            found = rows(connection, f"SELECT number, size_bytes FROM commits WHERE {clause}", values)
+            found = rows(connection, f"SELECT number, size_bytes, due_from FROM commits WHERE {clause}", values)
             numbers: list[int] = []
+            unread: set[int] = set()
             total_bytes = 0
-            for number, size_bytes in found:
-                total_bytes += size_bytes
+            for number, size_bytes, due_from in found:
+                # Folded: what its retract names is still to be done, and its own evidence, cold perhaps, is not needed.
+                if due_from is not None:
+                    unread.add(number)
+                else:
+                    total_bytes += size_bytes
                 if numbers and total_bytes > size_bytes_max:
                     break
                 numbers.append(number)
-            return _commits(connection, row, numbers, self._objects)
+            return _commits(connection, row, numbers, self._objects, unread=unread)
 
     def commit(self, row: MapRow, commit: CommitId) -> StoredCommit | None:
         """A commit with its diff, folded or not; None if there is none."""
         return self._commit(row, commit, OF_COMMIT)
+
+    def kept_sha(self, row: MapRow, commit: CommitId) -> bytes | None:
+        """SHA-256 of a commit whose evidence is kept, folded or not; None if there is none. No evidence is read."""
+        query = f"SELECT sha FROM commits WHERE {OF_COMMIT} AND NOT gone"
+        with self._connections.lent() as connection:
+            sha: bytes | None = first(connection, query, (row.number, *commit.author, commit.n))
+        return sha
 
     def folded(self, row: MapRow, commit: CommitId) -> StoredCommit | None:
         """A folded commit with its diff, or None."""
@@ -135,8 +147,10 @@ class PgReads:
             return None if number is None else _commits(connection, row, [number], self._objects)[0]
 
 
-def _commits(connection: Connection, row: MapRow, numbers: list[int], objects: ColdReads) -> list[StoredCommit]:
-    """Commits of these numbers, in this order, with their diffs.
+def _commits(
+    connection: Connection, row: MapRow, numbers: list[int], objects: ColdReads, *, unread: Collection[int] = ()
+) -> list[StoredCommit]:
+    """Commits of these numbers, in this order, with their diffs, but for the `unread` ones.
 
     Raises:
         AwayError: a diff is in the object store, which does not answer.
@@ -148,7 +162,7 @@ def _commits(connection: Connection, row: MapRow, numbers: list[int], objects: C
         "SELECT commit_number, cell, body, segment, start_bytes, size_bytes FROM diff"
         " WHERE map = %s AND layer = 0 AND commit_number = ANY(%s) ORDER BY cell"
     )
-    found = rows(connection, query, (row.number, numbers))
+    found = rows(connection, query, (row.number, [number for number in numbers if number not in unread]))
     cold = _cold_bodies([each[3:] for each in found if each[3] is not None], objects)
     for number, cell, body, name, start, _ in found:
         bodies[number][CellKey(cell)] = body if name is None else cold[name, start]

@@ -336,6 +336,14 @@ CREATE TABLE object_store (
     until timestamptz NOT NULL DEFAULT '-infinity'
 );
 """
+OWNED_OBJECTS = """
+-- The database that may settle and delete, as the object of its bucket says, too: no copy of this one may.
+ALTER TABLE object_store
+    ADD COLUMN era text,                            -- drawn when the bucket was taken, or adopted
+    ADD COLUMN turned_s float8 NOT NULL DEFAULT 0,  -- time of the newest turn of the bucket's object
+    ADD COLUMN listed_age_s float8 NOT NULL DEFAULT 0; -- age of the store when all names were listed last
+CREATE INDEX dead_object_doomed ON dead_object (map, name) WHERE doomed;
+"""
 BOUND_OLDEST = 4
 """Oldest step whose programs read a store of which bytes are in an object store."""
 
@@ -349,7 +357,7 @@ class Step:
     """Number of the oldest step whose programs work on a database that took this one."""
 
 
-STEPS = (Step(FIRST, oldest=1), Step(REPLICAS, oldest=1), Step(SERVERS, oldest=1), Step(OBJECTS, oldest=1))
+STEPS = tuple(Step(sql, oldest=1) for sql in (FIRST, REPLICAS, SERVERS, OBJECTS, OWNED_OBJECTS))
 
 
 def prepare(url: str, *, has_objects: bool = False) -> None:

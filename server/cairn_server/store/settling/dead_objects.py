@@ -7,6 +7,7 @@ that no row can come to name it any more, then deleted, then forgotten: a kill i
 
 import re
 from collections import defaultdict
+from collections.abc import Iterator
 
 from cairn_server.store.objects.bucket import Bucket
 from cairn_server.store.postgres.connections import Connections, rows
@@ -19,6 +20,9 @@ DOOM = """
     UPDATE dead_object SET doomed = true WHERE (map, name) IN (
         SELECT map, name FROM dead_object WHERE since_age_s < %s AND NOT doomed ORDER BY since_age_s LIMIT %s
     ) AND since_age_s < %s AND NOT doomed"""
+FORGET = """
+    DELETE FROM dead_object USING unnest(%s::bigint[], %s::text[]) AS u (map, name)
+    WHERE dead_object.map = u.map AND dead_object.name = u.name"""
 UNKNOWN = """
     SELECT name FROM unnest(%(names)s::text[]) AS u (name)
     WHERE NOT EXISTS (SELECT FROM dead_object AS d WHERE d.map = %(map)s AND d.name = u.name)
@@ -38,15 +42,15 @@ def delete_dead(connections: Connections, bucket: Bucket, *, before_s: float) ->
     with connections.lent() as connection:
         connection.execute(DOOM, (before_s, AT_ONCE, before_s))
         found = rows(connection, "SELECT map, name FROM dead_object WHERE doomed LIMIT %s", (AT_ONCE,))
-    for map_number, name in found:
-        bucket.delete(name)
+    if found:
+        bucket.delete_all([name for _, name in found])
         with connections.lent() as connection:
-            connection.execute("DELETE FROM dead_object WHERE map = %s AND name = %s", (map_number, name))
+            connection.execute(FORGET, ([number for number, _ in found], [name for _, name in found]))
     return len(found)
 
 
-def note_unknown(connections: Connections, bucket: Bucket, *, age_s: float) -> int:
-    """Note objects that the database does not know as dead since now; their count.
+def note_unknown(connections: Connections, bucket: Bucket, *, age_s: float) -> Iterator[int]:
+    """Note objects that the database does not know as dead since now; their count, page by page of the listing.
 
     There are some after a restore to an earlier time: every name is noted before its object is made. And of a settler
     that slept longer than the time of grace.
@@ -54,15 +58,12 @@ def note_unknown(connections: Connections, bucket: Bucket, *, age_s: float) -> i
     Raises:
         AwayError: the object store does not answer.
     """
-    count = 0
     for prefix in ("cells", "segments"):
         for page in bucket.names(prefix):
             by_map: defaultdict[int, list[str]] = defaultdict(list)
             for name in filter(OURS.match, page):
                 by_map[int(name.split("/")[1])].append(name)
-            for map_number, names in by_map.items():
-                count += _note_unknown(connections, map_number, names, age_s)
-    return count
+            yield sum(_note_unknown(connections, number, names, age_s) for number, names in by_map.items())
 
 
 def _note_unknown(connections: Connections, map_number: int, names: list[str], age_s: float) -> int:

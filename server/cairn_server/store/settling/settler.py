@@ -22,9 +22,11 @@ from cairn_server.store.objects.bucket import Bucket
 from cairn_server.store.objects.cold_bytes import cell_name, cell_object, segment_name
 from cairn_server.store.postgres.connections import Connection, Connections, first, rows
 from cairn_server.store.postgres.reads import PgReads
+from cairn_server.store.postgres.schema import STEPS
 from cairn_server.store.postgres.shares import lock_head
 from cairn_server.store.postgres.tile_rows import IN_TILES
 from cairn_server.store.settling.dead_objects import delete_dead, note_unknown
+from cairn_server.store.settling.ownership import TURN_S, Ownership
 from cairn_server.store.store_rows import MapRow
 from cairn_server.store.tiles import TILE_BITS
 
@@ -36,6 +38,8 @@ SEGMENT_BYTES = 16 << 20
 """Bytes from which on a segment is full."""
 COMMITS_AT_ONCE = 256
 """Most commits whose evidence is in a segment."""
+LIST_EVERY_S = 86_400.0
+"""Age of the store between two listings of all objects, for those that a restored database does not know."""
 CLAIM_S = 60
 """Seconds for which a settler's claim lasts."""
 AT_REST = """
@@ -71,7 +75,8 @@ SWAP_DIFFS = """
     RETURNING live"""
 CLAIM = """
     UPDATE object_store SET holder = %(holder)s, until = clock_timestamp() + make_interval(secs => %(for_s)s::float8)
-    WHERE holder = %(holder)s OR until < clock_timestamp() RETURNING 1"""
+    WHERE (holder = %(holder)s OR until < clock_timestamp()) AND (SELECT oldest FROM cairn_schema) <= %(known)s
+    RETURNING 1"""
 
 
 class Moved(NamedTuple):
@@ -104,17 +109,32 @@ class _Piece(NamedTuple):
 class Settler:
     """Moves of one database's bytes to a bucket; one thread at a time."""
 
-    def __init__(self, connections: Connections, bucket: Bucket, *, holder: str) -> None:
-        """Settle over these connections; `holder` names this process, unlike all others."""
+    def __init__(self, connections: Connections, bucket: Bucket, *, holder: str, turn_s: float = TURN_S) -> None:
+        """Settle over these connections; `holder` names this process, unlike all others, which proves itself often."""
         self._connections = connections
+        self._ownership = Ownership(connections, bucket, holder=holder, every_s=turn_s)
         self._reads = PgReads(connections, bucket)
         self._bucket = bucket
         self._holder = holder
 
+    def may_work(self) -> bool:
+        """True if this settler is the one of its database, and its database the owner of the bucket.
+
+        Raises:
+            BadInputError: kind `bad_objects`: the bucket is another database's.
+            AwayError: the object store does not answer.
+        """
+        return self.claim() and self._ownership.holds()
+
     def claim(self) -> bool:
-        """True if this settler is the one that works, for `CLAIM_S` from now on."""
+        """True if this settler is the one of its database that works, for `CLAIM_S` from now on."""
         with self._connections.lent() as connection:
-            return first(connection, CLAIM, {"holder": self._holder, "for_s": CLAIM_S}) is not None
+            return first(connection, CLAIM, {"holder": self._holder, "for_s": CLAIM_S, "known": len(STEPS)}) is not None
+
+    @property
+    def is_away(self) -> bool:
+        """True if the object store did not answer."""
+        return self._bucket.rests
 
     def release(self) -> None:
         """End the claim."""
@@ -137,19 +157,26 @@ class Settler:
         Raises:
             AwayError: the object store does not take them; what moved before stays there.
         """
-        query = "SELECT tile FROM tile WHERE map = %s AND layer = 0 AND lm > %s AND lm <= %s ORDER BY lm"
+        query = "SELECT tile, lm FROM tile WHERE map = %s AND layer = 0 AND lm > %s AND lm <= %s ORDER BY lm"
         with self._connections.lent() as connection:
             mark = first(connection, "SELECT seq FROM settled WHERE map = %s", (row.number,)) or 0
-            tiles = [tile for (tile,) in rows(connection, query, (row.number, mark, to_seq))]
+            tiles = rows(connection, query, (row.number, mark, to_seq))
         for start in range(0, len(tiles), TILES_AT_ONCE):
-            for cells in self._hot_cells(row, tiles[start : start + TILES_AT_ONCE]):
+            for cells in self._hot_cells(row, [tile for tile, _ in tiles[start : start + TILES_AT_ONCE]]):
                 yield self._move_cells(row, cells, age_s)
+            # A stop here costs these tiles only; the next ones may have the same entry as the last of them.
+            for _, lm in tiles[start + TILES_AT_ONCE : start + TILES_AT_ONCE + 1]:
+                self._note_settled(row, lm - 1)
+        self._note_settled(row, to_seq)
+
+    def _note_settled(self, row: MapRow, seq: int) -> None:
+        """Note that the tiles that changed up to an entry, and not after it, were moved."""
         query = (
             "INSERT INTO settled (map, seq) VALUES (%s, %s)"
             " ON CONFLICT (map) DO UPDATE SET seq = greatest(settled.seq, excluded.seq)"
         )
         with self._connections.lent() as connection:
-            connection.execute(query, (row.number, to_seq))
+            connection.execute(query, (row.number, seq))
 
     def settle_evidence(self, row: MapRow, *, before_s: float, age_s: float) -> Iterator[Moved]:
         """Move the evidence of all commits folded before an age of the store; what moved, segment by segment.
@@ -177,9 +204,17 @@ class Settler:
         """Delete objects that have been dead since before an age of the store (`dead_objects.delete_dead`)."""
         return delete_dead(self._connections, self._bucket, before_s=before_s)
 
-    def note_unknown(self, *, age_s: float) -> int:
-        """Note objects that the database does not know (`dead_objects.note_unknown`)."""
-        return note_unknown(self._connections, self._bucket, age_s=age_s)
+    def is_listing_due(self, *, age_s: float) -> bool:
+        """True if the objects were not listed for `LIST_EVERY_S`, by any server's settler."""
+        with self._connections.lent() as connection:
+            listed_s: float = first(connection, "SELECT listed_age_s FROM object_store") or 0.0
+        return age_s - listed_s > LIST_EVERY_S
+
+    def note_unknown(self, *, age_s: float) -> Iterator[int]:
+        """List all objects, and note those that the database does not know (`dead_objects.note_unknown`)."""
+        yield from note_unknown(self._connections, self._bucket, age_s=age_s)
+        with self._connections.lent() as connection:
+            connection.execute("UPDATE object_store SET listed_age_s = %s", (age_s,))
 
     def cell_count(self) -> int:
         """Count of the cells of all maps."""

@@ -72,6 +72,13 @@ class SqliteReads:
         """A commit with its diff, folded or not; None if there is none."""
         return self._commit("map = ? AND robot = ? AND incarnation = ? AND n = ?", row, commit)
 
+    def kept_sha(self, row: MapRow, commit: CommitId) -> bytes | None:
+        """SHA-256 of a commit whose evidence is kept, folded or not; None if there is none. No evidence is read."""
+        query = "SELECT sha FROM commits WHERE map = ? AND robot = ? AND incarnation = ? AND n = ? AND gone = 0"
+        with self._readers.reading() as reader:
+            sha: bytes | None = first(reader, query, (row.number, *commit.author, commit.n))
+        return sha
+
     def folded(self, row: MapRow, commit: CommitId) -> StoredCommit | None:
         """A folded commit with its diff, or None."""
         clause = "map = ? AND robot = ? AND incarnation = ? AND n = ? AND folded_seq IS NOT NULL"
