@@ -30,9 +30,25 @@ def with_progress(items: Iterable[Item], what: str, *, total: int) -> Iterator[I
 
 
 def with_passing_progress(items: Iterable[Item], what: str, *, total: int) -> Iterator[Item]:
-    """The items, with a bar below other output that is gone at the end; no bar where there is no terminal."""
-    with _bar(_console(), is_passing=True) as bar:
+    """The items, with a bar below other output that is gone at the end; in a log with a line every few seconds."""
+    console = _console()
+    if not console.is_terminal:
+        yield from _with_lines(items, what, total=total)
+        return
+    with _bar(console, is_passing=True) as bar:
         yield from bar.track(items, total=total, description=what)
+
+
+def _with_lines(items: Iterable[Item], what: str, *, total: int) -> Iterator[Item]:
+    """The items, with a line every few seconds: count, and the time left if the others take as long."""
+    began_s = shown_s = time.monotonic()
+    for done, item in enumerate(items, start=1):
+        now_s = time.monotonic()
+        if now_s - shown_s >= LOG_EVERY_S and done < total:
+            shown_s = now_s
+            left_s = (now_s - began_s) / done * (total - done)
+            sys.stderr.write(f"{what}: {done} of {total}, about {left_s:.0f} s left\n")
+        yield item
 
 
 @contextmanager
@@ -134,5 +150,4 @@ def _bar(console: "Console", *, is_passing: bool) -> "Progress":
         TimeRemainingColumn(),
         console=console,
         transient=is_passing,
-        disable=is_passing and not console.is_terminal,
     )

@@ -116,3 +116,20 @@ def _corner_rows(repeats: int) -> Iterator[Row]:
             return subprocess.run(line, check=True, capture_output=True)
 
         yield "the same as cairn calib corners, pictures and start too", f"{wall_s(command, repeats):.2f}", "s wall"
+    yield from _many_corner_rows(4 if repeats == 1 else 48)
+
+
+def _many_corner_rows(count: int) -> Iterator[Row]:
+    """A camera of 1280 x 1024 pixels before many places of a board, every sixth image without one."""
+    rng = np.random.default_rng(5)
+    spectrum = replace(COLOUR, camera=COLOUR.camera.model_copy(update={"height": 1024}))
+    with tempfile.TemporaryDirectory() as name:
+        paths = [Path(name) / f"{n}.png" for n in range(count)]
+        for n, path in enumerate(paths):
+            texture = 128 + 400 * cv2.GaussianBlur(rng.normal(size=(1024, 1280)), (0, 0), 4)
+            image = texture if n % 6 == 5 else picture(spectrum, pose(rng, spectrum), rng)
+            cv2.imwrite(str(path), np.clip(image, 0, 255).astype(np.uint8))
+        options = ["--board", "9x6", "--square", "0.05", "--jobs", "2", "--output", str(Path(name) / "out")]
+        line = [sys.executable, "-m", "cairn_calib.cli.corners", *map(str, paths), *options]
+        took = wall_s(lambda: subprocess.run(line, check=True, capture_output=True), 1)
+        yield f"cairn calib corners, {count} images of 1280 x 1024, 2 processes", f"{took:.1f}", "s wall, at most 15"

@@ -4,6 +4,7 @@ import io
 
 import pytest
 
+from cairn_map import progress
 from cairn_map.progress import (
     CLEAR_LINE,
     PercentLine,
@@ -31,6 +32,15 @@ def test_a_passing_bar_and_a_spinner_write_nothing_without_a_terminal(capsys: py
     with while_working("solving"):
         pass
     assert capsys.readouterr() == ("", "")
+
+
+def test_a_passing_bar_is_a_line_now_and_then_in_a_log(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = iter([0.0, 6.0, 12.0, 18.0, 24.0])
+    monkeypatch.setattr(progress.time, "monotonic", lambda: next(clock))
+    assert list(with_passing_progress("abcd", "images", total=4)) == ["a", "b", "c", "d"]
+    assert capsys.readouterr().err == "images: 2 of 4, about 12 s left\n"
 
 
 def test_a_line_is_replaced_on_a_terminal_and_kept_in_a_log() -> None:

@@ -61,6 +61,10 @@ class CornerFile(BaseModel):
     height: Side | None
     board: Board
     polarity: Polarity
+    vote: Polarity | None = None
+    """Polarity that the image itself tells, if any, or that was stated; `polarity` is that of all images together."""
+    upright: bool = False
+    """True if the first point is named by the rows of the image, not by the board's colours."""
     corners: Annotated[tuple[CornerEntry, ...], Field(max_length=64 * 64)]
     attempts: tuple[AttemptEntry, ...]
 
@@ -100,6 +104,8 @@ def corner_file(
     sha256: str | None,
     size: tuple[int, int] | None,
     polarity: Polarity,
+    vote: Polarity | None = None,
+    upright: bool = False,
     frames: int = 1,
 ) -> CornerFile:
     """Document of a detection in an image of `size` (width, height), which is the mean of `frames` frames.
@@ -117,6 +123,8 @@ def corner_file(
         height=height,
         board=board,
         polarity=polarity,
+        vote=vote,
+        upright=upright,
         corners=tuple(entries),
         attempts=tuple(_attempt_entry(attempt) for attempt in detection.attempts),
     )

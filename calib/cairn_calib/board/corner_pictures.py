@@ -42,7 +42,12 @@ def overlay(counts: Grey, corners: Corners | None, *, title: str) -> Picture:
 
 def write_picture(path: Path, picture: Picture) -> None:
     """Write a PNG file of a picture."""
-    path.write_bytes(bytes(cv2.imencode(".png", picture)[1]))
+    path.write_bytes(encode_picture(picture))
+
+
+def encode_picture(picture: Picture) -> bytes:
+    """PNG of a picture."""
+    return bytes(cv2.imencode(".png", picture)[1])
 
 
 def thumbnail(path: Path) -> bytes | None:

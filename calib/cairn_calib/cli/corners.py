@@ -21,7 +21,10 @@ are averaged (corners of 8 are almost 3 times as certain), and a board that move
 Each image gets a JSON document of its corners with covariances in pixels squared (CONVENTIONS.md), and a picture to
 look at. Parts of the board may be hidden, but each of its four sides must be seen in part. What only looks like a
 board is refused, and both files say at which stage; so is an image that repeats another one, count for count. An
-image that cannot be read is named, and the others are done.
+image that cannot be read is named, and the others are done. All cores work, an image each; each document is written
+as its image is done, so that after ^C or a power cut the same command with --resume goes on:
+
+    $ cairn calib corners left/*.png --board 9x6 --square 0.05 --output corners/ --resume
 
 Where detection fails, help it: name the outer four of the inner corners, to a few pixels, in the order first, end of
 first row, end of last row, start of last row, and pass the file as `--outer-corners`:
@@ -35,25 +38,30 @@ If no board was found in any image, that is an error (exit code 3).
 """
 
 import argparse
-import hashlib
+import os
 import sys
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 from pydantic import ValidationError
 
 from cairn_calib.board.board import Board, Polarity, board_size
-from cairn_calib.board.corner_detection import grey
-from cairn_calib.board.corner_file import CornerFile, corner_file, read_outer_corners
-from cairn_calib.board.corner_pictures import overlay, write_picture
-from cairn_calib.board.corners import Attempt, Detection
-from cairn_calib.board.polarity import PolarityCandidates, chessboard_candidates, count_votes, disc_candidates
-from cairn_calib.board.still_frames import StillImage, read_still, refuse_movement
+from cairn_calib.board.corner_file import read_outer_corners
+from cairn_calib.board.polarity import count_votes
+from cairn_calib.corner_search.corner_folder import document_path, image_name, picture_path, write_outcome
+from cairn_calib.corner_search.image_search import (
+    BoardSearch,
+    ImageTask,
+    SearchedImage,
+    outcome_line,
+    repeat_of,
+    settle,
+)
+from cairn_calib.corner_search.search_workers import search_images
 from cairn_map.arrays import Floats
-from cairn_map.errors import BadInputError, CairnError, DamagedDataError, NotFoundError, first_error
+from cairn_map.errors import BadInputError, CairnError, NotFoundError, first_error
 from cairn_map.progress import with_passing_progress
 
 NAMED_MAX = 8
@@ -105,24 +113,26 @@ def _add_arguments(corners: argparse.ArgumentParser) -> None:
         "--upright", action="store_true", help="rows of the board run along rows of the image, left to right"
     )
     corners.add_argument("--outer-corners", type=Path, metavar="FILE", help="corners pointed at by hand, JSON")
+    corners.add_argument("--resume", action="store_true", help="keep what an earlier run of this command has done")
+    corners.add_argument("--jobs", type=int, metavar="N", help="images at a time (the machine's cores)")
     corners.set_defaults(run=_run)
 
 
 def _run(args: argparse.Namespace) -> int:
     board = _board(args)
     pointed = read_outer_corners(args.outer_corners, board) if args.outer_corners else {}
-    names = [_name(path) for path in args.images]
+    names = [image_name(path) for path in args.images]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise BadInputError("image_name", f"images must have names of their own, {', '.join(twice)} comes twice")
-    for path, name in zip(args.images, names, strict=True):
+    for path in args.images:
         # A picture among a still pose's frames would be one of them the next time.
-        if path.resolve() in ((args.output / f"{name}.png").resolve(), args.output.resolve()):
+        if path.resolve() in (picture_path(args.output, path).resolve(), args.output.resolve()):
             raise BadInputError(
                 "image_name", f"the picture of {path}'s corners would overwrite it: give another --output"
             )
     by_hand = args.outer_corners.resolve() if args.outer_corners else None
-    if by_hand in [(args.output / f"{name}.json").resolve() for name in names]:
+    if by_hand in [document_path(args.output, path).resolve() for path in args.images]:
         raise BadInputError("image_name", f"a document of corners would overwrite {args.outer_corners}: move that")
     missing = [str(path) for path in args.images if not path.exists()]
     if missing:
@@ -133,18 +143,11 @@ def _run(args: argparse.Namespace) -> int:
             "image_name", f"{args.outer_corners} names images that were not given: {', '.join(unknown)}"
         )
     args.output.mkdir(parents=True, exist_ok=True)
-    seen_before: dict[bytes, str] = {}
-    results = [
-        _find_and_draw(path, board, args, pointed.get(path.name), seen_before)
-        for path in with_passing_progress(args.images, "images", total=len(args.images))
-    ]
-    polarity = _polarity([each.candidates for each in results], args)
-    for each in results:
-        if each.candidates.detection(polarity).corners is not each.candidates.likely.corners:
-            _draw(each.path, read_still(each.path), each.candidates.detection(polarity), args.output)
-        document = each.document(board, polarity).model_dump_json(indent=1)
-        (args.output / f"{_name(each.path)}.json").write_text(document + "\n", encoding="utf-8")
-    lost = [each.path.name for each in results if each.candidates.detection(polarity).corners is None]
+    tasks = _tasks(args, BoardSearch(board, args.polarity, args.upright), pointed)
+    results = _search_and_write(tasks, args)
+    polarity = _polarity(results, args)
+    results = [_settle_and_write(task, each, polarity, args) for task, each in zip(tasks, results, strict=True)]
+    lost = [each.document.image for each in results if not each.document.corners]
     found = len(args.images) - len(lost)
     more = f" and {len(lost) - NAMED_MAX} more" if len(lost) > NAMED_MAX else ""
     others = f"; the others: {', '.join(lost[:NAMED_MAX])}{more}" if lost else ""
@@ -154,6 +157,57 @@ def _run(args: argparse.Namespace) -> int:
             "no_board", f"no board in any image; {args.output}/*.json say at which stage each attempt ended"
         )
     return 0
+
+
+def _tasks(args: argparse.Namespace, search: BoardSearch, pointed: Mapping[str, Floats]) -> list[ImageTask]:
+    return [
+        ImageTask(
+            path,
+            search,
+            pointed=pointed.get(path.name),
+            document=document_path(args.output, path) if args.resume else None,
+        )
+        for path in args.images
+    ]
+
+
+def _search_and_write(tasks: Sequence[ImageTask], args: argparse.Namespace) -> list[SearchedImage]:
+    """Outcomes of all images, each written and reported as it is done; their pictures are let go."""
+    results: list[SearchedImage] = []
+    seen_before: dict[bytes, str] = {}
+    outcomes = search_images(tasks, jobs=_jobs(args.jobs))
+    try:
+        for each in with_passing_progress(outcomes, "images", total=len(tasks)):
+            task, searched = tasks[len(results)], each
+            if each.counts_sha256 is not None:
+                first = seen_before.setdefault(each.counts_sha256, task.path.name)
+                searched = each if first == task.path.name else repeat_of(each, task, first)
+            if not searched.is_kept:
+                write_outcome(args.output, task.path, searched)
+                _say(outcome_line(searched.document))
+            results.append(replace(searched, picture=None))
+    except KeyboardInterrupt:
+        _say(f"stopped after {len(results)} of {len(tasks)} images; the same command with --resume goes on")
+        raise
+    kept = sum(each.is_kept for each in results)
+    if args.resume:
+        _say(f"resumed: {kept} of {len(tasks)} images were done")
+    return results
+
+
+def _settle_and_write(
+    task: ImageTask, searched: SearchedImage, polarity: Polarity, args: argparse.Namespace
+) -> SearchedImage:
+    settled = settle(searched, task, polarity)
+    if settled is not searched:
+        write_outcome(args.output, task.path, settled)
+    return settled
+
+
+def _jobs(jobs: int | None) -> int:
+    if jobs is not None and jobs < 1:
+        raise BadInputError("bad_arguments", f"--jobs is a number of processes, at least 1, got {jobs}")
+    return jobs or os.cpu_count() or 1
 
 
 def _board(args: argparse.Namespace) -> Board:
@@ -168,108 +222,20 @@ def _board(args: argparse.Namespace) -> Board:
         raise BadInputError("bad_board", f"--disc: {first_error(exc)}") from exc
 
 
-def _name(path: Path) -> str:
-    return path.resolve().name if path.is_dir() else path.stem
-
-
-@dataclass(frozen=True, slots=True)
-class _ImageResult:
-    """Detections in one image; without digest and size where it cannot be read."""
-
-    path: Path
-    candidates: PolarityCandidates
-    sha256: str | None
-    size: tuple[int, int] | None
-    frames: int
-
-    def document(self, board: Board, polarity: Polarity) -> CornerFile:
-        """Document of its corners, to be written once all images have voted."""
-        return corner_file(
-            self.candidates.detection(polarity),
-            board,
-            image=self.path.name,
-            sha256=self.sha256,
-            size=self.size,
-            polarity=polarity,
-            frames=self.frames,
-        )
-
-
-def _find_and_draw(
-    path: Path, board: Board, args: argparse.Namespace, pointed: Floats | None, seen_before: dict[bytes, str]
-) -> _ImageResult:
-    """Find the board in one image, report and draw it; `seen_before` names images by the digest of their counts."""
-    try:
-        image = read_still(path)
-        grey(image.counts)
-    except (BadInputError, DamagedDataError) as exc:
-        unread = _no_detection("reading", exc.message)
-        (args.output / f"{_name(path)}.png").unlink(missing_ok=True)  # of another image of this name
-        _say(_line(path, unread.likely))
-        return _ImageResult(path, unread, None, None, 1)
-    candidates = _find(image, path, board, args, pointed, seen_before)
-    _say(_line(path, candidates.likely))
-    _draw(path, image, candidates.likely, args.output)
-    height, width = image.counts.shape
-    return _ImageResult(path, candidates, image.sha256, (width, height), image.frames)
-
-
-def _find(
-    image: StillImage,
-    path: Path,
-    board: Board,
-    args: argparse.Namespace,
-    pointed: Floats | None,
-    seen_before: dict[bytes, str],
-) -> PolarityCandidates:
-    twin = seen_before.setdefault(hashlib.sha256(image.counts.tobytes()).digest(), path.name)
-    if twin != path.name:
-        # The board has moved since, and its place is not in it.
-        why = f"the same counts as {twin}; cameras repeat an image when they lose one, or level themselves"
-        return _no_detection("repeated", why)
-    look = disc_candidates if board.pattern != "chessboard" else chessboard_candidates
-    found = look(image.counts, board, polarity=args.polarity, upright=args.upright, pointed=pointed)
-    return found.filter(lambda detection: refuse_movement(image, detection))
-
-
-def _draw(path: Path, image: StillImage, detection: Detection, folder: Path) -> None:
-    write_picture(folder / f"{_name(path)}.png", overlay(image.counts, detection.corners, title=_line(path, detection)))
-
-
-def _line(path: Path, detection: Detection) -> str:
-    return f"{path.name}: {_outcome(detection)}"
-
-
-def _polarity(candidates: Sequence[PolarityCandidates], args: argparse.Namespace) -> Polarity:
+def _polarity(results: Sequence[SearchedImage], args: argparse.Namespace) -> Polarity:
     chosen: Polarity | Literal["vote"] = args.polarity
     if chosen != "vote":
         return chosen
-    vote = count_votes([each.vote for each in candidates])
+    vote = count_votes([each.document.vote for each in results])
     if vote.polarity is not None:
-        _say(f"polarity {vote.polarity}: {vote} of {len(candidates)} images")
+        _say(f"polarity {vote.polarity}: {vote} of {len(results)} images")
         return vote.polarity
-    if any(each.likely.corners is not None for each in candidates):
+    if any(each.document.corners for each in results):
         _say(
-            f"polarity unknown, taken for normal: {vote} of {len(candidates)} images; if this camera sees what is "
+            f"polarity unknown, taken for normal: {vote} of {len(results)} images; if this camera sees what is "
             "printed dark as bright, say --polarity reversed"
         )
     return "normal"
-
-
-def _no_detection(stage: str, reason: str) -> PolarityCandidates:
-    """Candidates of an image in which no corners were searched, with the reason."""
-    nothing = Detection(None, (Attempt("image", 1.0, stage, reason),))
-    return PolarityCandidates(nothing, nothing, None)
-
-
-def _outcome(detection: Detection) -> str:
-    last = detection.attempts[-1]
-    if detection.corners is None:
-        furthest = max(detection.attempts, key=lambda attempt: attempt.stage != "candidates")
-        return f"no board ({furthest.stage}: {furthest.reason})"
-    seen = detection.corners.seen
-    sigma = float(np.sqrt(np.nanmedian(np.trace(detection.corners.covariance_px2, axis1=1, axis2=2) / 2)))
-    return f"{seen.sum()} of {len(seen)} corners, sigma {sigma:.3f} px ({last.method} x{last.scale:g})"
 
 
 def _say(text: str) -> None:

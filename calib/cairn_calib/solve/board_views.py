@@ -7,7 +7,7 @@ Images belong to one frame by their names: `frame_pairing.py` says how.
 """
 
 import hashlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -141,7 +141,7 @@ def read_board_views(folders: Mapping[str, Path], *, frame: str | None = None) -
         # A camera is a folder: one polarity, one image size.
         documents = _documents(folder)
         inputs += [_input_file(camera, path) for path, _ in documents]
-        polarities[camera] = documents[0][1].polarity
+        polarities[camera] = _one_polarity(folder, [document for _, document in documents])
         sizes[camera] = _one_size(camera, [document for _, document in documents])
         used: dict[str, Path] = {}
         names = frames_of([path.stem for path, _ in documents], frame)
@@ -171,6 +171,18 @@ def _documents(folder: Path) -> list[tuple[Path, CornerFile]]:
     if not paths:
         raise BadInputError(KIND, f"{folder} holds no corner documents (*.json): make them with cairn calib corners")
     return [(path, read_corner_file(path)) for path in paths]
+
+
+def _one_polarity(folder: Path, documents: Sequence[CornerFile]) -> Polarity:
+    """Polarity of a camera; the first corner of a chessboard that is not known to be upright depends on it."""
+    named = {each.polarity for each in documents if each.corners and each.board.pattern == "chessboard"}
+    if len(named) > 1 and not all(each.upright for each in documents):
+        raise BadInputError(
+            KIND,
+            f"the documents in {folder} do not agree whether dark or bright is printed, since their run was cut, or "
+            "there were several: run cairn calib corners for all images of this camera with --resume",
+        )
+    return documents[0].polarity
 
 
 def _one_size(camera: str, documents: Iterable[CornerFile]) -> tuple[int, int]:
