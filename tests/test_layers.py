@@ -34,6 +34,7 @@ MAY_NAME = {
         "cairn_calib/rig/image_files.py",
         "cairn_calib/verify/disc_images.py",
         "cairn_calib/thermal/flir_file.py",
+        "cairn_calib/board/grid_fit.py",
         "cairn_calib/board/saddle_points.py",
         "cairn_calib/board/still_frames.py",
         "cairn_calib/exchange/opencv_corners.py",

@@ -30,6 +30,7 @@ PIPELINES = (
     "cairn_calib/board/corner_detection.py",
     "cairn_calib/board/corner_gates.py",
     "cairn_calib/board/corner_refinement.py",
+    "cairn_calib/board/grid_fit.py",
     "cairn_calib/board/saddle_grid.py",
     "cairn_calib/board/saddle_points.py",
     "cairn_calib/diagnosis/next_image.py",

@@ -1,4 +1,4 @@
-"""Boards of a real recording, changed as cameras would: turned, inverted, blurred, made smaller, with noise."""
+"""Boards of a real recording, changed as cameras would: turned, inverted, blurred, smaller, with noise, or near."""
 
 import os
 from dataclasses import dataclass
@@ -21,6 +21,8 @@ OFF_CELLS = 0.1
 """By which a corner may lie elsewhere than in the image as recorded, cells."""
 BLUR_PX, NOISE = (0.3, 1.0), (1.0, 10.0)
 """In the changed image; noise in counts of 255."""
+NEAR_SCALES, NEAR_BLUR_PX = (1.5, 2.0, 3.0, 4.0), 4.0
+"""Enlargements of near boards; blur in pixels of the image as recorded."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,33 @@ def changed(seed: int) -> Change:
     values = (values if polarity == "normal" else 255 - values) + rng.normal(0, noise, values.shape)
     text = f"{name} x{scale:.2f}, turned {90 * turns} deg, blur {blur:.1f} px, noise {noise:.1f}, {polarity}"
     return Change(np.clip(values, 0, 255).astype(np.uint8), at, polarity, cell * scale, text)
+
+
+def near(seed: int) -> Change:
+    """One of the recorded images as a camera close to the board would see it: cut, enlarged, inverted, blurred."""
+    rng = np.random.default_rng([seed, 37])
+    name, image, at = recorded()[int(rng.integers(len(recorded())))]
+    cell = float(np.nanmin(np.linalg.norm(np.diff(at.reshape(BOARD.rows, BOARD.columns, 2), axis=1), axis=-1)))
+    # What is left about the outer corners, cells of the image as recorded.
+    around = cell * float(rng.choice([0.45, 1.3, 9.0]))
+    low = np.clip(np.nanmin(at, axis=0) - around, 0, None).astype(int)
+    high = np.clip(np.nanmax(at, axis=0) + around + 1, 0, image.shape[::-1]).astype(int)
+    scale = float(rng.choice(NEAR_SCALES))
+    cut = image[low[1] : high[1], low[0] : high[0]]
+    values = cv2.resize(cut, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+    blur = scale * float(rng.uniform(0, NEAR_BLUR_PX))
+    if blur > 0.2:
+        values = cv2.GaussianBlur(values, (0, 0), blur)
+    polarity: Polarity = "normal" if rng.random() < 0.5 else "reversed"
+    values = np.asarray(values if polarity == "normal" else 255 - values, np.uint8)
+    text = f"{name} x{scale:g}, {around / cell:g} cells about it, blur {blur:.1f} px, {polarity}"
+    return Change(values, (at - low + 0.5) * scale - 0.5, polarity, cell * scale, text)
+
+
+def found_by_opencv(change: Change) -> bool:
+    """True if one of OpenCV's two detectors finds the board."""
+    size = (BOARD.columns, BOARD.rows)
+    return bool(cv2.findChessboardCorners(change.image, size)[0] or cv2.findChessboardCornersSB(change.image, size)[0])
 
 
 def found_as_recorded(change: Change) -> bool:

@@ -11,7 +11,10 @@ FLAT_RMS_PX, FLAT_RMS_CELLS = 0.5, 0.01
 """Largest root mean square miss, pixels plus cells: a lens with more radial terms bends large boards a little."""
 RADIAL = (-0.4, 0.8)
 """Bounds of the radial term, in units in which the distance from the image's middle to its corner is 1."""
-
+CENTRE_SIGMA = 0.3
+"""Standard deviation of the lens's middle about the image's, in those units: images may be cut out of larger ones."""
+DIFFERENCE = 1e-3
+"""Step for derivatives by the radial term and by the middle."""
 FARTHEST = 2.0
 """Distance from the image's middle, in units of its corner's, at which places further out are clamped."""
 
@@ -50,28 +53,31 @@ def flat_view(lattice: Floats, pixels: Floats, shape: tuple[int, ...]) -> FlatVi
     Args:
         lattice: (N, 2) places.
         pixels: (N, 2) where they were found, none of them NaN.
-        shape: rows and columns of the image, whose middle is the lens's.
+        shape: rows and columns of the image; the lens's middle is near its middle.
     """
-    centre = np.array([shape[1] - 1, shape[0] - 1]) / 2
-    scale = float(np.hypot(*centre))
-    # In units in which the image's corner is 1 from its middle, so that k is a pure number.
-    plane = (pixels - centre) / scale
-    square = (plane**2).sum(axis=1, keepdims=True)
+    middle = np.array([shape[1] - 1, shape[0] - 1]) / 2
+    scale = float(np.hypot(*middle))
 
-    def view(k: float) -> FlatView | None:
-        homography = fit_homography(lattice, plane * (1 + k * square))
+    def view(at: Floats) -> FlatView | None:
+        # In units in which the image's corner is 1 from its middle, so that k is a pure number.
+        k, centre = float(at[0]), middle + scale * at[1:]
+        plane = (pixels - centre) / scale
+        homography = fit_homography(lattice, plane * (1 + k * (plane**2).sum(axis=1, keepdims=True)))
         return None if homography is None else FlatView(homography, k, centre, scale)
 
-    # Gauss and Newton for k; each value has its own homography, so the slope is taken by a difference.
-    k = 0.0
-    for _ in range(3):
-        here, ahead = view(k), view(k + 1e-3)
-        if here is None or ahead is None:
+    # Gauss and Newton for k and the lens's middle; each has its own homography, so slopes are taken by differences.
+    unknown = np.zeros(3)
+    prior = np.diag([0.0, 1.0, 1.0]) * FLAT_RMS_PX / CENTRE_SIGMA
+    for _ in range(4):
+        here, *ahead = (view(unknown + step) for step in (np.zeros(3), *(DIFFERENCE * np.eye(3))))
+        if here is None or any(each is None for each in ahead):
             return None
-        missed = here.misses_px(lattice, pixels)
-        slope = (ahead.misses_px(lattice, pixels) - missed) / 1e-3
-        k = float(np.clip(k - (slope * missed).sum() / max(float((slope**2).sum()), 1e-12), *RADIAL))
-    return view(k)
+        missed = here.misses_px(lattice, pixels).ravel()
+        slopes = [(each.misses_px(lattice, pixels).ravel() - missed) / DIFFERENCE for each in ahead if each]
+        system = np.concatenate([np.stack(slopes, axis=1), prior])
+        unknown = unknown - np.linalg.lstsq(system, np.concatenate([missed, prior @ unknown]), rcond=None)[0]
+        unknown = np.clip(unknown, [RADIAL[0], -1, -1], [RADIAL[1], 1, 1])
+    return view(unknown)
 
 
 def flat_limit_px(cell_px: float) -> float:

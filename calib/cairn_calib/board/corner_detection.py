@@ -9,15 +9,17 @@ nor its polarity is trusted: the fitted contrasts say which cells are bright, an
 look in this camera.
 """
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from cairn_calib.board.board import Board, Polarity
-from cairn_calib.board.corner_gates import FittedGrid, checker_signs, refusal, sound_corners
-from cairn_calib.board.corner_refinement import FittedCorners, fit_corners
+from cairn_calib.board.corner_gates import FittedGrid, checker_signs
 from cairn_calib.board.corners import FOUND, Attempt, Corners, Detection
-from cairn_calib.board.homography import fit_homography, map_points, steps_between
+from cairn_calib.board.grid_fit import fit_board
+from cairn_calib.board.homography import fit_homography, map_points
 from cairn_calib.board.saddle_grid import NoGrid, saddle_grid
 from cairn_calib.board.saddle_points import saddle_points
 from cairn_map.arrays import Floats
@@ -42,8 +44,6 @@ RADON_LATTICE_SHARE = (0.3, 1.3)
 """Corners of the largest lattice of saddles, over the board's, at which OpenCV's detector is run. It takes most of
 the time, and found 1 of 142 boards that were too blurred or noisy for saddles, none of 4 000 others. Its older one,
 findChessboardCorners, found none of them."""
-PASSES = 4
-"""Fits of the whole grid, at most; each predicts the corners that are lost from those that the one before kept."""
 SHADE_SHARE = 0.15
 """Standard deviation of the Gaussian that takes shading out of 16-bit images, share of the longest side."""
 
@@ -140,79 +140,15 @@ def _judge(
     if isinstance(proposal, NoGrid):
         return Attempt(method, scale, "candidates", proposal.reason), None
     # Pixel centres are at whole numbers, so an image's edge is at -0.5 at every scale.
-    grid_found = fit_grid((proposal + 0.5) / scale - 0.5, counts, board)
-    if grid_found is None:
-        reason = "the edges that cross at the proposed corners cannot be fitted"
-        return Attempt(method, scale, "refinement", reason), None
-    grid_found = _order_as_board(grid_found, polarity=polarity, upright=upright)
-    refused = refusal(grid_found)
-    if refused is not None:
-        return Attempt(method, scale, *refused), None
-    corners = Corners(board, grid_found.fitted.pixels, grid_found.fitted.covariance_px2)
-    return Attempt(method, scale, FOUND, f"{grid_found.kept.sum()} corners"), corners
-
-
-def fit_grid(grid: Floats, counts: Image, board: Board) -> FittedGrid | None:
-    """Grid of fitted corners from proposed ones; hidden or wrong ones are searched where the others predict them.
-
-    Args:
-        grid: (rows, columns, 2) or (N, 2) proposed pixels, NaN where unknown.
-        counts: (H, W) image as recorded.
-        board: the chessboard.
-
-    Returns:
-        The grid; None where fewer than 8 corners are left, or they determine no homography.
-    """
-    lattice, signs = board.lattice(), checker_signs(board)
-    guesses = grid.reshape(-1, 2).copy()
-    fitted = None
-    for _ in range(PASSES):
-        known = np.isfinite(guesses[:, 0])
-        homography = fit_homography(lattice[known], guesses[known]) if known.sum() >= 8 else None
-        if homography is None:
-            return None
-        # Predict what is missing, fit everything, and drop what is no corner of this board.
-        guesses = np.where(known[:, None], guesses, _predict(homography, lattice, guesses, known))
-        steps = steps_between(homography, lattice)
-        fitted = _drop_unsound(fit_corners(counts, guesses, steps), signs, apart_px=0.5 * _shortest_px(steps))
-        guesses = fitted.pixels
-        if not np.isnan(guesses).any():
-            break
-    known = np.isfinite(guesses[:, 0])
-    homography = fit_homography(lattice[known], guesses[known]) if known.sum() >= 8 else None
-    return None if homography is None or fitted is None else FittedGrid(counts, board, fitted, homography)
-
-
-def _predict(homography: Floats, lattice: Floats, guesses: Floats, known: npt.NDArray[np.bool_]) -> Floats:
-    """(N, 2) predicted corners: the homography, plus its miss at the nearest known corner."""
-    plain = map_points(homography, lattice)
-    off = np.where(known[:, None], guesses - plain, 0)
-    away = np.where(known, np.linalg.norm(lattice[:, None] - lattice[None], axis=2), np.inf)
-    return np.asarray(plain + off[away.argmin(axis=1)])
-
-
-def _shortest_px(steps: Floats) -> float:
-    return float(np.nan_to_num(np.linalg.norm(steps, axis=2), nan=np.inf).min())
-
-
-def _drop_unsound(fitted: FittedCorners, signs: Floats, *, apart_px: float) -> FittedCorners:
-    """Fitted corners, NaN for those that are no corners of this board.
-
-    Where two names have come to one place, either may be wrong, so neither is kept: the others predict both again.
-    """
-    # Corners that do not look like this board's, then those that coincide.
-    lost = ~sound_corners(fitted, signs)
-    apart = np.linalg.norm(fitted.pixels[:, None] - fitted.pixels[None], axis=2)
-    apart[np.diag_indices(len(apart))] = np.inf
-    with np.errstate(invalid="ignore"):
-        lost |= ((apart < apart_px) & ~lost).any(axis=1)
-    return FittedCorners(
-        pixels=np.where(lost[:, None], np.nan, fitted.pixels),
-        covariance_px2=np.where(lost[:, None, None], np.nan, fitted.covariance_px2),
-        contrast=np.where(lost, np.nan, fitted.contrast),
-        misfit=np.where(lost, np.nan, fitted.misfit),
-        moved=np.where(lost, np.nan, fitted.moved),
+    found = fit_board(
+        (proposal + 0.5) / scale - 0.5,
+        counts,
+        board,
+        order=lambda grid_found: _order_as_board(grid_found, polarity=polarity, upright=upright),
     )
+    if isinstance(found, Corners):
+        return Attempt(method, scale, FOUND, f"{found.seen.sum()} corners"), found
+    return Attempt(method, scale, *found), None
 
 
 def _order_as_board(grid_found: FittedGrid, *, polarity: Polarity, upright: bool) -> FittedGrid:
@@ -228,11 +164,10 @@ def _order_as_board(grid_found: FittedGrid, *, polarity: Polarity, upright: bool
         # The board's first cell is printed dark; half a turn swaps the colours.
         bright_first = np.nansum(grid_found.fitted.contrast * checker_signs(board)) > 0
         turn = 2 if bright_first == (polarity == "normal") else 0
-    order = np.rot90(index, turn).ravel()
-    f = grid_found.fitted
-    # A quarter turn swaps the cells that the sign of a contrast speaks of.
-    turned_contrast = f.contrast[order] * (1 if turn % 2 == 0 else -1)
-    fitted = FittedCorners(f.pixels[order], f.covariance_px2[order], turned_contrast, f.misfit[order], f.moved[order])
+    fitted = grid_found.fitted.reorder(np.rot90(index, turn).ravel())
+    if turn % 2:
+        # A quarter turn swaps the cells that the sign of a contrast speaks of.
+        fitted = replace(fitted, contrast=-fitted.contrast)
     lattice = board.lattice()
     known = np.isfinite(fitted.pixels[:, 0])
     homography = fit_homography(lattice[known], fitted.pixels[known])
@@ -276,11 +211,7 @@ def fit_pointed_at(image: npt.NDArray[np.generic], board: Board, pointed: Floats
     if homography is None:
         return Detection(None, (Attempt("by hand", 1.0, "candidates", "the corners pointed at lie on a line"),))
     grid = map_points(homography, lattice) if len(pointed) == 4 else pointed
-    grid_found = fit_grid(grid, counts, board)
-    if grid_found is None:
-        return Detection(None, (Attempt("by hand", 1.0, "refinement", "no edges cross near the corners pointed at"),))
-    refused = refusal(grid_found)
-    if refused is not None:
-        return Detection(None, (Attempt("by hand", 1.0, *refused),))
-    found = Attempt("by hand", 1.0, FOUND, f"{grid_found.kept.sum()} corners")
-    return Detection(Corners(board, grid_found.fitted.pixels, grid_found.fitted.covariance_px2), (found,))
+    found = fit_board(grid, counts, board, order=lambda grid_found: grid_found)
+    if isinstance(found, Corners):
+        return Detection(found, (Attempt("by hand", 1.0, FOUND, f"{found.seen.sum()} corners"),))
+    return Detection(None, (Attempt("by hand", 1.0, *found),))

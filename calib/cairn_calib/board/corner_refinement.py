@@ -11,7 +11,7 @@ the least-squares fit, with the noise found in the residuals. It is right for no
 pixel; compression and interpolation make it too small, by a factor that a solve finds per camera.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +19,7 @@ import numpy.typing as npt
 from cairn_map.arrays import Flags, Floats
 
 Image = npt.NDArray[np.float32]
+Indices = npt.NDArray[np.intp]
 
 STEPS = 12
 """Gauss-Newton steps, at most."""
@@ -35,6 +36,8 @@ TURN_SIGMA_RAD = 0.15
 """Prior of an edge's direction about that of the grid, standard deviation: only tiny windows feel it."""
 BLUR_LOG_SIGMA = 0.7
 """Prior of the blur about 0.8 px, standard deviation of its logarithm."""
+BORDER_PX = 3
+"""Half width, pixels, below which no window shrinks at the image's border."""
 PIXELS_MIN = 12
 """Pixels of a window without which its corner is not fitted."""
 UNKNOWNS = 7
@@ -59,6 +62,18 @@ class FittedCorners:
     """(N,) root mean square of the residuals, share of the contrast."""
     moved: Floats
     """(N,) how far the corner lies from its guess, cells."""
+    blur_px: Floats
+    """(N,) standard deviation of the Gaussian that blurs its edges."""
+
+    def reorder(self, order: Indices) -> "FittedCorners":
+        """The same corners in another order."""
+        return FittedCorners(*(getattr(self, each.name)[order] for each in fields(self)))
+
+    def only(self, kept: Flags) -> "FittedCorners":
+        """The same corners, NaN where they are not kept."""
+        # Arrays of one, two and three dimensions, each with the corners first.
+        values = (getattr(self, each.name) for each in fields(self))
+        return FittedCorners(*(np.where(kept.reshape(-1, *[1] * (v.ndim - 1)), v, np.nan) for v in values))
 
 
 def fit_corners(image: Image, guesses: Floats, steps: Floats) -> FittedCorners:
@@ -83,6 +98,7 @@ def fit_corners(image: Image, guesses: Floats, steps: Floats) -> FittedCorners:
         contrast=final.contrast,
         misfit=np.sqrt(final.variance) / np.maximum(np.abs(final.contrast), 1e-9),
         moved=np.where(np.isfinite(final.pixels[:, 0]), np.linalg.norm(moved, axis=1), np.nan),
+        blur_px=final.blur,
     )
 
 
@@ -94,6 +110,7 @@ class _Fit:
     dof: Floats
     mean: Floats
     contrast: Floats
+    blur: Floats
 
 
 def _fit(image: Image, guesses: Floats, steps: Floats, shading: Floats) -> _Fit:
@@ -149,6 +166,7 @@ def _fit(image: Image, guesses: Floats, steps: Floats, shading: Floats) -> _Fit:
         dof=dof,
         mean=unknown[:, 5],
         contrast=unknown[:, 6],
+        blur=unknown[:, 4],
     )
 
 
@@ -177,9 +195,11 @@ def _windows(
     # In the lattice's own axes a window is a square, however the board is tilted.
     cells = np.linalg.solve(_columns(safe)[:, None], away[..., None])[..., 0]
     inside = (x >= 0) & (y >= 0) & (x < image.shape[1]) & (y < image.shape[0])
-    near = (np.abs(cells) < reach[:, None]).all(axis=-1) & (np.hypot(away[..., 0], away[..., 1]) < radius + 0.5)
+    # At the border of the image the window is smaller all round: one that lost a side would pull its corner inwards.
+    border = np.minimum(at, np.array(image.shape[::-1]) - 1 - at).min(axis=1)
+    limit = np.minimum(radius, np.maximum(border, BORDER_PX))[:, None] + 0.5
+    near = (np.abs(cells) < reach[:, None]).all(axis=-1) & (np.hypot(away[..., 0], away[..., 1]) < limit)
     weight = (inside & near).astype(np.float64)
-    # A corner at the border of the image that lost half of its window would be pulled inwards.
     return x, y, weight, sound & (weight.sum(axis=1) >= np.maximum(PIXELS_MIN, 0.8 * near.sum(axis=1)))
 
 

@@ -2,9 +2,10 @@
 
 import os
 
+import cv2
 import pytest
 from tests.board_finding.empty_images import SMALL, empty_image
-from tests.board_finding.real_boards import changed, found_as_recorded, recorded, voted
+from tests.board_finding.real_boards import changed, found_as_recorded, found_by_opencv, near, recorded, voted
 from tests.board_finding.trials import found_rightly, trial
 from tests.fixtures.calib.board_images import BOARD
 
@@ -48,6 +49,27 @@ def test_what_was_once_a_board_or_an_error_is_neither() -> None:
         named, image = empty_image(seed)
         assert named == kind
         assert find_chessboard(image, BOARD).corners is None
+
+
+@pytest.mark.slow
+def test_no_grid_is_found_in_large_images_without_a_board() -> None:
+    for seed in range(EMPTY // 6):
+        _, image = empty_image(seed, sizes=SMALL)
+        large = cv2.resize(image, None, fx=6, fy=6, interpolation=cv2.INTER_CUBIC)
+        assert find_chessboard(large, BOARD).corners is None, seed
+
+
+@pytest.mark.slow
+@pytest.mark.recording
+def test_near_real_boards_are_found_wherever_one_of_opencvs_detectors_finds_them() -> None:
+    if not recorded():
+        pytest.skip("CAIRN_TEST_DATA is not set")
+    missed = [
+        change.text
+        for change in map(near, range(2 * REAL))
+        if not found_as_recorded(change) and found_by_opencv(change)
+    ]
+    assert missed == []
 
 
 @pytest.mark.slow

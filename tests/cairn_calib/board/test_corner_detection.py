@@ -93,6 +93,30 @@ def test_a_board_of_which_a_side_is_hidden_is_refused_with_the_stage() -> None:
     assert {attempt.stage for attempt in detection.attempts}.isdisjoint({FOUND})
 
 
+@pytest.mark.parametrize("seed", [3, 5])
+def test_a_near_board_whose_soft_edges_are_wider_than_a_corners_window_is_found(seed: int) -> None:
+    image, at = seen(TOF, seed)
+    large = cv2.resize(image, None, fx=10, fy=10, interpolation=cv2.INTER_CUBIC)
+    soft = cv2.GaussianBlur(large, (0, 0), 12)
+    corners = found(find_chessboard(soft, BOARD))
+    assert corners.seen.sum() >= 53
+    assert np.nanmax(np.abs(corners.pixels - ((at + 0.5) * 10 - 0.5))) < 3
+
+
+def test_a_board_at_the_border_of_a_cut_image_keeps_its_corners_unbiased() -> None:
+    errors, covariances = [], []
+    for seed in range(4):
+        image, at = seen(TOF, seed)
+        low, high = (at.min(axis=0) - 2.6).astype(int), (at.max(axis=0) + 3.6).astype(int)
+        cut = np.asarray(image)[low[1] : high[1], low[0] : high[0]]
+        corners = found(find_chessboard(cut, BOARD))
+        errors.append((corners.pixels + low - at)[corners.seen])
+        covariances.append(corners.covariance_px2[corners.seen])
+    error, covariance = np.concatenate(errors), np.concatenate(covariances)
+    assert len(error) > 200
+    assert 0.8 < normalised(error, covariance).std() < 1.25
+
+
 def test_boards_that_look_the_same_after_half_a_turn_need_to_stand_upright() -> None:
     board = Board(columns=7, rows=5, pitch_m=0.05)
     rng = np.random.default_rng(2)

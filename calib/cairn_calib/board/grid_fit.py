@@ -1,0 +1,153 @@
+"""Fit of a whole chessboard to proposed corners, at a scale at which its cells have the size that the gates know.
+
+    proposal -> image reduced until cells are 16 to 32 px -> corners fitted, hidden ones predicted -> order -> gates
+             -> corners fitted again at the finest scale at which their edges are sharp
+
+What large, near cells add to a corner's window (soft edges, the grain of paper, light that flows over an edge) is of
+the same size in cells as that of small ones, and is judged so. Hidden corners stay hidden.
+"""
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from cairn_calib.board.board import Board
+from cairn_calib.board.corner_gates import LIKE_MOVED, FittedGrid, checker_signs, refusal, sound_corners
+from cairn_calib.board.corner_refinement import FittedCorners, fit_corners
+from cairn_calib.board.corners import Corners
+from cairn_calib.board.homography import fit_homography, map_points, steps_between
+from cairn_map.arrays import Flags, Floats
+
+Image = npt.NDArray[np.float32]
+
+PASSES = 4
+"""Fits of the whole grid, at most; each predicts the corners that are lost from those that the one before kept."""
+CELL_PX = 16.0
+"""Cells are at least this large at the scale of the gates, pixels, and less than twice this, if the image allows."""
+SHARP_PX = 2.5
+"""Blur of edges, pixels, up to which a corner's window of 17 x 17 pixels holds them; softer ones are fitted at a
+coarser scale."""
+NO_FIT = "refinement", "the edges that cross at the proposed corners cannot be fitted"
+
+
+def fit_board(
+    grid: Floats, counts: Image, board: Board, *, order: Callable[[FittedGrid], FittedGrid]
+) -> Corners | tuple[str, str]:
+    """Corners of the board at proposed places; or the stage that refuses, and why.
+
+    Args:
+        grid: (rows, columns, 2) or (N, 2) proposed pixels, NaN where unknown.
+        counts: (H, W) image as recorded.
+        board: the chessboard.
+        order: puts the board's first corner first.
+    """
+    # The scale: a power of 2, so that pixels are means of whole pixels.
+    factor = 1 << max(0, int(np.floor(np.log2(max(_step_px(grid, board) / CELL_PX, 1.0)))))
+    # Pixel centres are at whole numbers, so an image's edge is at -0.5 at every scale.
+    found = fit_grid((grid + 0.5) / factor - 0.5, _reduce(counts, factor), board)
+    if found is None:
+        return NO_FIT
+    found = order(found)
+    return refusal(found) or _sharpen(found, counts, factor)
+
+
+def _step_px(grid: Floats, board: Board) -> float:
+    """Median step from corner to corner, pixels."""
+    # Along rows and along columns, whatever is known.
+    places = grid.reshape(board.rows, board.columns, 2)
+    steps = [np.linalg.norm(np.diff(places, axis=k), axis=-1).ravel() for k in (0, 1)]
+    return float(np.nanmedian(np.concatenate(steps)))
+
+
+def _reduce(counts: Image, factor: int) -> Image:
+    """Image of the means of squares of `factor` pixels; what is left at its right and bottom edge is cut."""
+    height, width = (side // factor * factor for side in counts.shape)
+    if factor == 1:
+        return counts
+    size = width // factor, height // factor
+    return np.asarray(cv2.resize(counts[:height, :width], size, interpolation=cv2.INTER_AREA), np.float32)
+
+
+def _sharpen(found: FittedGrid, counts: Image, factor: int) -> Corners:
+    """Corners of a grid that passed the gates at a coarse scale, from the finest one at which their edges are sharp."""
+    board, signs = found.board, checker_signs(found.board)
+    coarse = found.fitted
+    pixels, covariance = (coarse.pixels + 0.5) * factor - 0.5, coarse.covariance_px2 * factor**2
+    # From the image as recorded to coarser ones, until edges are sharp enough for a window.
+    finer = 1
+    while finer < factor:
+        image = _reduce(counts, finer)
+        guesses = (pixels + 0.5) / finer - 0.5
+        homography = fit_homography(board.lattice()[found.kept], guesses[found.kept])
+        if homography is None:
+            break
+        # Corners that the coarse scale lost at the image's border are searched where the others predict them.
+        guesses = np.where(found.kept[:, None], guesses, _predict(homography, board.lattice(), guesses, found.kept))
+        fitted = fit_corners(image, guesses, steps_between(homography, board.lattice()))
+        # A corner that is not sound at this scale keeps its place from the coarse one.
+        sound = sound_corners(fitted, signs) & (fitted.moved < LIKE_MOVED)
+        if sound.sum() >= found.kept.sum() / 2 and np.median(fitted.blur_px[sound]) <= SHARP_PX:
+            pixels = np.where(sound[:, None], (fitted.pixels + 0.5) * finer - 0.5, pixels)
+            covariance = np.where(sound[:, None, None], fitted.covariance_px2 * finer**2, covariance)
+            break
+        finer *= 2
+    return Corners(board, pixels, covariance)
+
+
+def fit_grid(grid: Floats, counts: Image, board: Board) -> FittedGrid | None:
+    """Grid of fitted corners from proposed ones; hidden or wrong ones are searched where the others predict them.
+
+    Args:
+        grid: (rows, columns, 2) or (N, 2) proposed pixels, NaN where unknown.
+        counts: (H, W) image as recorded.
+        board: the chessboard.
+
+    Returns:
+        The grid; None where fewer than 8 corners are left, or they determine no homography.
+    """
+    lattice, signs = board.lattice(), checker_signs(board)
+    guesses = grid.reshape(-1, 2).copy()
+    fitted = None
+    for _ in range(PASSES):
+        known = np.isfinite(guesses[:, 0])
+        homography = fit_homography(lattice[known], guesses[known]) if known.sum() >= 8 else None
+        if homography is None:
+            return None
+        # Predict what is missing, fit everything, and drop what is no corner of this board.
+        guesses = np.where(known[:, None], guesses, _predict(homography, lattice, guesses, known))
+        steps = steps_between(homography, lattice)
+        fitted = fit_corners(counts, guesses, steps)
+        fitted = fitted.only(_sound_and_apart(fitted, signs, apart_px=0.5 * _shortest_px(steps)))
+        guesses = fitted.pixels
+        if not np.isnan(guesses).any():
+            break
+    known = np.isfinite(guesses[:, 0])
+    homography = fit_homography(lattice[known], guesses[known]) if known.sum() >= 8 else None
+    return None if homography is None or fitted is None else FittedGrid(counts, board, fitted, homography)
+
+
+def _predict(homography: Floats, lattice: Floats, guesses: Floats, known: npt.NDArray[np.bool_]) -> Floats:
+    """(N, 2) predicted corners: the homography, plus its miss at the nearest known corner."""
+    plain = map_points(homography, lattice)
+    off = np.where(known[:, None], guesses - plain, 0)
+    away = np.where(known, np.linalg.norm(lattice[:, None] - lattice[None], axis=2), np.inf)
+    return np.asarray(plain + off[away.argmin(axis=1)])
+
+
+def _shortest_px(steps: Floats) -> float:
+    return float(np.nan_to_num(np.linalg.norm(steps, axis=2), nan=np.inf).min())
+
+
+def _sound_and_apart(fitted: FittedCorners, signs: Floats, *, apart_px: float) -> Flags:
+    """(N,) True for each fitted corner that is one of this board.
+
+    Where two names have come to one place, either may be wrong, so neither is kept: the others predict both again.
+    """
+    # Corners that do not look like this board's, then those that coincide.
+    sound = sound_corners(fitted, signs)
+    apart = np.linalg.norm(fitted.pixels[:, None] - fitted.pixels[None], axis=2)
+    apart[np.diag_indices(len(apart))] = np.inf
+    with np.errstate(invalid="ignore"):
+        return np.asarray(sound & ~((apart < apart_px) & sound).any(axis=1))
