@@ -12,6 +12,7 @@ from importlib import import_module
 from importlib.metadata import entry_points
 
 from cairn_calib.cli import check as check_command
+from cairn_calib.cli import compare as compare_command
 from cairn_calib.cli import convert as convert_command
 from cairn_calib.cli import convert_corners as convert_corners_command
 from cairn_calib.cli import corners as corners_command
@@ -23,6 +24,7 @@ from cairn_calib.cli import thermal as thermal_command
 # it needs recordings or the simulator, one with `main(argv)` behind an entry point of GROUP.
 SUBCOMMANDS = (
     check_command,
+    compare_command,
     convert_command,
     convert_corners_command,
     corners_command,
