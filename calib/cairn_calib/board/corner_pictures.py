@@ -8,6 +8,7 @@ import numpy.typing as npt
 
 from cairn_calib.board.corners import Corners
 from cairn_calib.rig.image_files import Grey
+from cairn_map.arrays import Floats
 
 Picture = npt.NDArray[np.uint8]
 
@@ -20,6 +21,8 @@ STRETCH = (0.5, 99.8)
 BAND_PX = 28
 """Height of the band above the image that holds the title, pixels."""
 THUMBNAIL_PX, JPEG_QUALITY = 320, 82
+OUTSIDE = (217, 205, 201)
+"""Colour of what a resampled picture does not show."""
 FIRST, LAST, TEXT = (60, 60, 255), (255, 160, 40), (80, 255, 80)
 
 
@@ -52,14 +55,9 @@ def encode_picture(picture: Picture) -> bytes:
 
 def thumbnail(path: Path) -> bytes | None:
     """A JPEG, 320 pixels wide, of a picture that `overlay` made and `write_picture` wrote; None if there is none."""
-    try:
-        data = np.frombuffer(path.read_bytes(), np.uint8)
-    except OSError:
+    image = _without_band(path)
+    if image is None:
         return None
-    picture = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
-    if picture is None or picture.shape[0] <= BAND_PX:
-        return None
-    image = picture[BAND_PX:]
     height = max(1, round(image.shape[0] * THUMBNAIL_PX / image.shape[1]))
     small = cv2.resize(image, (THUMBNAIL_PX, height), interpolation=cv2.INTER_AREA)
     return bytes(cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1])
@@ -83,3 +81,29 @@ def _draw(picture: Picture, corners: Corners, scale: int) -> None:
         if index == 0:
             cv2.circle(picture, centre, 12, FIRST, 2, cv2.LINE_AA)
             cv2.circle(picture, centre, 16, FIRST, 1, cv2.LINE_AA)
+
+
+def resampled(path: Path, size_px: tuple[int, int], at: Floats) -> bytes | None:
+    """A JPEG of a picture that `overlay` made of an image of `size_px`, sampled at (H, W, 2) pixels of that image.
+
+    Grey where a pixel is NaN or outside; None if there is no picture.
+    """
+    picture = _without_band(path)
+    if picture is None:
+        return None
+    # The picture may be an enlargement of the image; centres of pixels are at whole numbers in both.
+    scale = picture.shape[1] / size_px[0]
+    where = np.where(np.isfinite(at), (at + 0.5) * scale - 0.5, -1e6).astype(np.float32)
+    x, y = np.ascontiguousarray(where[..., 0]), np.ascontiguousarray(where[..., 1])
+    found = cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=OUTSIDE)
+    return bytes(cv2.imencode(".jpg", found, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1])
+
+
+def _without_band(path: Path) -> Picture | None:
+    """The picture in a file of `write_picture`, without its title; None if there is none."""
+    try:
+        data = np.frombuffer(path.read_bytes(), np.uint8)
+    except OSError:
+        return None
+    picture = cv2.imdecode(data, cv2.IMREAD_COLOR) if data.size else None
+    return None if picture is None or picture.shape[0] <= BAND_PX else np.asarray(picture[BAND_PX:], np.uint8)

@@ -24,13 +24,15 @@ class ReportImage:
     document: CornerFile
     picture: bytes | None
     """JPEG; None where there is no picture next to the document."""
+    source: Path | None = None
+    """The picture's file."""
 
 
 def report_images(folders: Mapping[str, Path]) -> dict[str, list[ReportImage]]:
     """The images in folders of corner documents, by camera; the first sixty of each."""
     return {
         camera: [
-            ReportImage(read_corner_file(path), thumbnail(path.with_suffix(".png")))
+            ReportImage(read_corner_file(path), thumbnail(path.with_suffix(".png")), path.with_suffix(".png"))
             for path in sorted(folder.glob("*.json"))[:IMAGES_MAX]
         ]
         for camera, folder in folders.items()

@@ -22,6 +22,7 @@ from cairn_calib.diagnosis.view_statistics import view_residuals
 from cairn_calib.diagnosis.world_uncertainty import sigma_map
 from cairn_calib.report.range_report import ranges_json
 from cairn_calib.report.report_radiometry import radiometry_json
+from cairn_calib.report.validity import validity
 from cairn_calib.rig.calibration import unit_of
 from cairn_calib.solve.rig_state import WARP
 
@@ -65,10 +66,10 @@ def examination_json(seen: Examination) -> bytes:
 
 def _camera(seen: Examination, name: str) -> dict[str, object]:
     covered = next(each for each in seen.coverage if each.camera == name)
+    residuals = [each for each in view_residuals(seen.solution) if each.camera == name]
     images = [
         {"frame": each.frame, "image": each.image, "rms_px": each.rms_px, "outliers": each.outliers}
-        for each in view_residuals(seen.solution)
-        if each.camera == name
+        for each in residuals
     ]
     maps = {
         f"{far:g} m": np.round(sigma_map(seen.solution, seen.rig, name, far, columns=MAP_COLUMNS), 4).tolist()
@@ -81,6 +82,7 @@ def _camera(seen: Examination, name: str) -> dict[str, object]:
         "radius_share": covered.radius_share,
         "corners_by_part": covered.counts.tolist(),
         "sigma_px_by_part": maps,
+        "validity": validity(seen, name, residuals).to_json(),
         "images": images,
     }
 

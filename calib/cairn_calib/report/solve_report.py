@@ -15,8 +15,12 @@ from cairn_calib.report.range_report import range_facts
 from cairn_calib.report.report_images import ReportImage, image_figures
 from cairn_calib.report.report_radiometry import radiometry_facts
 from cairn_calib.report.solve_tables import board_table, image_table, lens_table, place_table, statistics_table
+from cairn_calib.report.straight_lines import straight_figure
+from cairn_calib.report.validity import validity, validity_figure, validity_rows
+from cairn_calib.rig.projection_uncertainty import mounted_lens
 from cairn_map.arrays import Floats
 
+VALIDITY_HEAD = ("distance", "boards", "median sigma inside, px", "largest sigma outside, px")
 INFLUENCES = 8
 """Frames of greatest influence that the report lists."""
 
@@ -36,7 +40,10 @@ def report_page(seen: Examination, images: Mapping[str, Sequence[ReportImage]] |
         board=board_table(seen),
         ranges=range_facts(seen),
         heat=heat_legend(),
-        cameras=[_camera(seen, name, [each for each in residuals if each.camera == name]) for name in cameras],
+        cameras=[
+            _camera(seen, name, [each for each in residuals if each.camera == name], (images or {}).get(name, ()))
+            for name in cameras
+        ],
         halves=_halves(seen),
         images=image_table(residuals, cameras, seen.solution.views.frames),
         influences=_influences(seen),
@@ -70,7 +77,9 @@ def _head(seen: Examination) -> dict[str, object] | None:
     }
 
 
-def _camera(seen: Examination, name: str, residuals: Sequence[ViewResiduals]) -> dict[str, object]:
+def _camera(
+    seen: Examination, name: str, residuals: Sequence[ViewResiduals], images: Sequence[ReportImage]
+) -> dict[str, object]:
     """Pictures of one camera: residuals, coverage, and maps of its uncertainty at several ranges."""
     solution, gauge = seen.solution, seen.solution.plan.gauge
     size = solution.views.sizes_px[name]
@@ -85,8 +94,12 @@ def _camera(seen: Examination, name: str, residuals: Sequence[ViewResiduals]) ->
             _map_figure(size, transfer_map(seen.rig, gauge, name, far), f"What {gauge} sees at {far:g} m")
             for far in RANGES_M
         ]
+    known = validity(seen, name, residuals)
     return {
         "name": name,
+        "valid": validity_figure(size, known),
+        "by_range": Table(VALIDITY_HEAD, validity_rows(known)),
+        "straight": straight_figure(mounted_lens(seen.rig, name), images),
         "arrows": Figure(
             quiver(size, corners, misses, kept, sigma),
             f"Residuals, enlarged so that {2 * sigma:.2g} px are as long as 4 % of the image is wide; red: left out",

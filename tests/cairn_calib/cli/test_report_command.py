@@ -50,11 +50,19 @@ def test_the_report_comes_again_with_radiometry_and_images(
     assert "comes from these corners" in capsys.readouterr().out
     page = (folder / "again.html").read_text(encoding="utf-8")
     assert "not radiometric" not in page and "two black bodies" in page
-    assert page.count("data:image/jpeg;base64,") == 12 and "rms 0." in page
+    assert page.count("data:image/jpeg;base64,") == 12 + 2 and page.count(", undistorted: straight lines") == 2
+    assert page.count("Range of validity: green") == 2 and "rms 0." in page
     assert not re.search(r'(src|href)="(?!data:)', page)
     counts = 2.0 / float(known.response.slope(280.0))
     assert f"<td>{counts:.3f}</td>" in page
-    assert json.loads((folder / "again.json").read_text())["radiometry"]["thermal-left"]["range_k"] == [280.0, 380.0]
+    document = json.loads((folder / "again.json").read_text())
+    assert document["radiometry"]["thermal-left"]["range_k"] == [280.0, 380.0]
+    valid = document["cameras"]["tof"]["validity"]
+    assert 0.1 < valid["image_share"] < 1 and len(valid["hull_px"]) > 3
+    seen = {each["range_m"]: each["is_seen"] for each in valid["by_range"]}
+    assert seen[valid["nearest_m"]] and seen[valid["farthest_m"]] and not seen[20.0]
+    sigmas = [(each["inside_sigma_px"], each["outside_sigma_px"]) for each in valid["by_range"]]
+    assert all(0 < inside < outside for inside, outside in sigmas)
 
 
 def test_another_rig_or_other_corners_are_refused(solved: tuple[Path, list[str]], tmp_path: Path) -> None:
