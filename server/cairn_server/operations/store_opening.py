@@ -43,6 +43,7 @@ def store_of(settings: Settings) -> tuple[Callable[[], Store], Callable[[], Fold
         )
     try:
         from cairn_server.store.objects.bucket import open_bucket
+        from cairn_server.store.objects.read_ahead import ReadAhead
         from cairn_server.store.settling.binding import bind
     except ImportError as exc:
         raise _not_installed("--objects s3://...", "obstore", "objects") from exc
@@ -60,7 +61,7 @@ def store_of(settings: Settings) -> tuple[Callable[[], Store], Callable[[], Fold
             raise
         return store
 
-    return open_store, lambda: PgReads(Connections(url, limit=FOLD_CONNECTIONS), open_bucket(place))
+    return open_store, lambda: PgReads(Connections(url, limit=FOLD_CONNECTIONS), ahead=ReadAhead(open_bucket(place)))
 
 
 def settling(service: Service) -> AbstractContextManager[object]:

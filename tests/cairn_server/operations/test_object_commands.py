@@ -1,6 +1,7 @@
 """`cairn serve --store --objects` over a real database and a real object store, which goes away and comes back."""
 
 import re
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from tests.fixtures.server.object_store import READER, ObjectPlace
 from tests.fixtures.server.postgres import Database, PostgresServer, new_database
 from tests.fixtures.server.pushes import KEYS, pushed
 
-from cairn_map.errors import BadInputError
+from cairn_map.errors import BadInputError, DamagedDataError
 from cairn_map.evidence.grid import cell_of_key
 from cairn_server.operations.serve import main
 
@@ -129,3 +130,35 @@ def test_a_place_that_will_not_do_is_refused_with_the_next_step(
     assert not place.names()
     with pytest.raises(BadInputError, match="--objects: expected a URL"):
         main(["check", "--store", database.url, "--objects", "x"])
+
+
+def test_a_dump_that_takes_the_place_of_its_original_adopts_the_bucket(
+    database: Database,
+    place: ObjectPlace,
+    at_once: Path,
+    tmp_path: Path,
+    ended: list[Process],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    options = "--objects", place.url, "--settings", str(at_once)
+    url = served(tmp_path / "one", database, ended, *options)
+    push(url, COMMITS[0])
+    until(lambda: warm(database) == 0 and folded(url, 1), "everything moved")
+    ended[-1].send(signal.SIGTERM)
+    ended.pop().end()
+    copy = Database(database.server, f"{database.name}_copy")
+    copy.server.execute(f"CREATE DATABASE {copy.name} TEMPLATE {database.name}")
+    named_by = "--store", copy.url, "--objects", place.url
+    with pytest.raises(DamagedDataError):
+        main(["check", *named_by])
+    assert "objects: the bucket is not this database's" in capsys.readouterr().out
+    url = served(tmp_path / "two", copy, ended, *options)
+    push(url, COMMITS[1])
+    until(lambda: 'failures_total{what="own"}' in httpx.get(f"{url}/metrics").text, "the bucket is not its own")
+    assert warm(copy) > 0
+    assert main(["adopt", *named_by]) == 0
+    assert "until now by database" in capsys.readouterr().out
+    until(lambda: warm(copy) == 0 and folded(url, 2), "everything moved")
+    assert main(["check", *named_by]) == 0
+    with pytest.raises(BadInputError, match="another store"):
+        main(["adopt", "--store", new_database(database.server).url, "--objects", place.url])

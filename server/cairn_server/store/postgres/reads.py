@@ -1,7 +1,7 @@
 """Reads of a PostgreSQL store outside a snapshot: maps, and commits with their evidence."""
 
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -11,6 +11,7 @@ from cairn_map.evidence.grid import CellKey, Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.store.history import KnownVectors
 from cairn_server.store.objects.cold_bytes import ColdReads, NoObjects
+from cairn_server.store.objects.read_ahead import NamedSize, ReadAhead
 from cairn_server.store.postgres.connections import Connection, Connections, first, rows
 from cairn_server.store.postgres.retention import is_retracted
 from cairn_server.store.postgres.schema import IS_WAITING
@@ -22,10 +23,13 @@ from cairn_server.store.stored_columns import ids_from_text
 class PgReads:
     """The reading half of `store.Store`."""
 
-    def __init__(self, connections: Connections, objects: ColdReads | None = None) -> None:
-        """Read a database, and what moved from it to an object store."""
+    def __init__(
+        self, connections: Connections, objects: ColdReads | None = None, *, ahead: ReadAhead | None = None
+    ) -> None:
+        """Read a database, and what moved from it to an object store: cells of pending commits ahead, if so said."""
         self._connections = connections
-        self._objects = objects or NoObjects()
+        self._objects = ahead or objects or NoObjects()
+        self._ahead = ahead
         self._vectors = KnownVectors()
         self._maps: dict[int, MapRow] = {}
 
@@ -90,7 +94,12 @@ class PgReads:
                 if numbers and total_bytes > size_bytes_max:
                     break
                 numbers.append(number)
-            return _commits(connection, row, numbers, self._objects, unread=unread)
+            commits = _commits(connection, row, numbers, self._objects, unread=unread)
+            cold = _cold_cells(connection, row, commits) if self._ahead is not None else []
+        # No transaction waits for it.
+        if self._ahead is not None:
+            self._ahead.read(cold)
+        return commits
 
     def commit(self, row: MapRow, commit: CommitId) -> StoredCommit | None:
         """A commit with its diff, folded or not; None if there is none."""
@@ -185,6 +194,16 @@ def _commits(
         )
     }
     return [known[number] for number in numbers]
+
+
+def _cold_cells(connection: Connection, row: MapRow, commits: Iterable[StoredCommit]) -> list[NamedSize]:
+    """Objects of the cells that these commits change, in the order of the commits."""
+    keys = list(dict.fromkeys(int(key) for commit in commits for key in commit.diff))
+    query = (
+        "SELECT object, size_bytes FROM unnest(%s::bigint[]) WITH ORDINALITY AS u (key, place)"
+        " JOIN cell ON map = %s AND layer = 0 AND cell = key WHERE body IS NULL ORDER BY place"
+    )
+    return [NamedSize(*found) for found in rows(connection, query, (keys, row.number))]
 
 
 def _cold_bodies(pieces: list[tuple[str, int, int]], objects: ColdReads) -> dict[tuple[str, int], bytes]:
