@@ -30,7 +30,7 @@ SCRUB_PER_DAY = 0.01
 SCRUB_MAX = 16
 """Most cells that are read at one look."""
 FAILURES_MAX = 8
-"""Failures after which no more maps are settled at one look."""
+"""Failures after which no more maps are settled at one look: a failure of all maps is not found out map by map."""
 LARGEST_WAIT_S = 30.0
 """Longest time between two attempts while they fail."""
 
@@ -90,12 +90,10 @@ class SettleThread:
         for row in rows:
             with self._duty("cells", row):
                 self._settle_cells(row, now_s)
-            if not self._settler.is_away:
-                with self._duty("evidence", row):
-                    before_s = now_s - settings.settle_evidence_s
-                    self._take(row, "evidence", self._settler.settle_evidence(row, before_s=before_s, age_s=now_s))
-            # A failure of all maps is not found out map by map.
-            if self._settler.is_away or not self._goes_on():
+            with self._duty("evidence", row):
+                before_s = now_s - settings.settle_evidence_s
+                self._take(row, "evidence", self._settler.settle_evidence(row, before_s=before_s, age_s=now_s))
+            if not self._goes_on():
                 return
             if self._failures >= FAILURES_MAX:
                 break

@@ -12,7 +12,7 @@ from tests.fixtures.server.postgres import Database, PostgresServer, new_databas
 from tests.fixtures.server.pushes import WREN, pushed
 from tests.fixtures.server.settled_store import ColdStore, SwitchedBucket
 
-from cairn_server.operations.settle_thread import SettleThread
+from cairn_server.operations.settle_thread import FAILURES_MAX, SettleThread
 from cairn_server.store.objects.cold_bytes import AwayError
 from cairn_server.store.settling.dead_objects import AT_ONCE
 from cairn_server.store.settling.settler import LIST_EVERY_S
@@ -105,10 +105,10 @@ def test_objects_are_listed_each_day_of_the_store_however_often_servers_start(se
     assert settling.bucket.objects() == set()
 
 
-def test_a_store_that_is_away_is_not_asked_for_each_map(settling: Settling) -> None:
-    for _ in range(3):
-        folded_map(settling.store, pushed(0, 0))
-    assert settling.store.settler.may_work()
-    settling.bucket.is_away = True
+def test_a_failure_of_all_maps_is_not_found_out_map_by_map(settling: Settling) -> None:
+    maps = [folded_map(settling.store, pushed(0, 0)) for _ in range(FAILURES_MAX + 4)]
+    settling.bucket.refused = "cells/"
     settling.look()
-    assert settling.database.execute("SELECT count(*) FROM dead_object") == [(0,)]
+    assert len(settling.warm()) == len(maps)
+    figures = settling.live.http.get("/metrics").text
+    assert f'cairn_settle_failures_total{{what="cells"}} {FAILURES_MAX}.0' in figures

@@ -199,14 +199,13 @@ def test_a_reply_of_cells_that_are_away_is_one_line_in_the_log(
     assert caplog.text.count("is sent without its bytes") == 1
 
 
-def test_a_check_of_a_store_that_is_away_is_no_finding(cold: Cold, bucket: SwitchedBucket) -> None:
-    live, row = cold.live, cold.live.new_map()
-    live.push(row, evidence_in(FAR, n=1))
-    until(lambda: not is_waiting(live, row, evidence_in(FAR, n=1)), "it is folded")
-    drain(cold.store.settler.settle_cells(row, to_seq=9, age_s=0.0))
-    bucket.is_away = True
-    with pytest.raises(AwayError):
-        check_map(cold.store, row, lambda done, total: None)
+def test_a_check_of_a_store_that_is_away_is_no_finding(newest_postgres: PostgresServer, bucket: SwitchedBucket) -> None:
+    with closing(ColdStore(new_database(newest_postgres).url, bucket)) as store:
+        row = folded_map(store, evidence_in(FAR, n=0))
+        drain(store.settler.settle_cells(row, to_seq=9, age_s=0.0))
+        bucket.is_away = True
+        with pytest.raises(AwayError):
+            check_map(store, row, lambda done, total: None)
 
 
 def test_the_state_of_an_upload_is_known_without_its_evidence(cold: Cold, bucket: SwitchedBucket) -> None:

@@ -70,11 +70,6 @@ class Bucket:
         self.failures = 0
         """Count of the calls that the store did not answer."""
 
-    @property
-    def rests(self) -> bool:
-        """True from a failure of the store until it answers again."""
-        return self._rest_s > 0
-
     def get(self, name: str) -> bytes | None:
         """An object's bytes; None: there is no such object.
 
@@ -123,7 +118,7 @@ class Bucket:
         Raises:
             AwayError: the store does not take one of them; others may be there.
         """
-        _at_once([partial(self.put, name, data) for name, data in objects])
+        _run_together([partial(self.put, name, data) for name, data in objects])
 
     def delete(self, name: str) -> None:
         """Delete an object, if it is there.
@@ -143,7 +138,7 @@ class Bucket:
         Raises:
             AwayError: the store does not delete one of them; others may be gone.
         """
-        _at_once([partial(self.delete, name) for name in names])
+        _run_together([partial(self.delete, name) for name in names])
 
     def names(self, prefix: str) -> Iterator[list[str]]:
         """Names of all objects whose names begin so, some at a time.
@@ -244,7 +239,7 @@ def _client(timeout_s: int) -> "ClientConfig":
     }
 
 
-def _at_once(jobs: Sequence[Callable[[], None]]) -> None:
+def _run_together(jobs: Sequence[Callable[[], None]]) -> None:
     """Run jobs, several at a time, all of them to their ends; the first failure is raised."""
     if len(jobs) == 1:
         jobs[0]()

@@ -1,6 +1,7 @@
-"""Bond of a database and the place of its cold bytes: each says which the other is, so that none is mistaken.
+"""Bond of a store and its bucket: one id in both, so that a wrong bucket is refused at the start.
 
 The first server that is started with --objects makes it. The bucket may move: what counts is the object that marks it.
+All copies of a database have its id; which of them may write there is the matter of `ownership`.
 """
 
 import secrets

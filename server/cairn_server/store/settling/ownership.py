@@ -32,6 +32,8 @@ TURN_S = 20.0
 """Time between two turns."""
 STILL_TURNS = 15
 """Turns of the other settler for which its text has to stand still: one that writes 64 MB over a slow link is alive."""
+CHECK_SHARE = 0.1
+"""Share of a turn for which the object is not read again: who takes the bucket waits for many turns first."""
 TAIL_S = 600.0
 """Longest time by which a database may be behind its bucket's object and go on: turns that a failover lost."""
 ERA_BYTES = 16
@@ -80,7 +82,7 @@ class Ownership:
         self._every_s = every_s
         self._steady_s = steady_s
         self._written: bytes | None = None
-        self._written_s = 0.0
+        self._written_s = self._checked_s = 0.0
         self._found: bytes | None = None
         self._found_s: float | None = None
 
@@ -91,9 +93,12 @@ class Ownership:
             BadInputError: kind `bad_objects`: the bucket is another database's.
             AwayError: the object store does not answer.
         """
-        found = self._bucket.get(OWNER)
+        now_s = self._steady_s()
+        if self._written is not None and now_s - self._checked_s < CHECK_SHARE * self._every_s:
+            return True
+        found, self._checked_s = self._bucket.get(OWNER), now_s
         if found is not None and found == self._written:
-            if self._steady_s() - self._written_s >= self._every_s:
+            if now_s - self._written_s >= self._every_s:
                 self._turn(_row(self._connections))
             return True
         self._written = None

@@ -110,7 +110,7 @@ class Settler:
     """Moves of one database's bytes to a bucket; one thread at a time."""
 
     def __init__(self, connections: Connections, bucket: Bucket, *, holder: str, turn_s: float = TURN_S) -> None:
-        """Settle over these connections; `holder` names this process, unlike all others, which proves itself often."""
+        """Settle over these connections; `holder` is this process's own name, `turn_s` the time between its turns."""
         self._connections = connections
         self._ownership = Ownership(connections, bucket, holder=holder, every_s=turn_s)
         self._reads = PgReads(connections, bucket)
@@ -130,11 +130,6 @@ class Settler:
         """True if this settler is the one of its database that works, for `CLAIM_S` from now on."""
         with self._connections.lent() as connection:
             return first(connection, CLAIM, {"holder": self._holder, "for_s": CLAIM_S, "known": len(STEPS)}) is not None
-
-    @property
-    def is_away(self) -> bool:
-        """True if the object store did not answer."""
-        return self._bucket.rests
 
     def release(self) -> None:
         """End the claim."""
