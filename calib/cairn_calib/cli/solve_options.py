@@ -3,6 +3,7 @@
 import argparse
 from pathlib import Path
 
+from cairn_calib.cli.known_lenses import add_known_options, with_known
 from cairn_calib.rig.rig import Spectrum
 from cairn_calib.solve.board_views import BoardViews, add_ranges, read_board_views
 from cairn_calib.solve.solve_plan import PITCH_SIGMA, CameraPlan, SolvePlan, usual_plan
@@ -26,6 +27,7 @@ def add_solve_options(parser: argparse.ArgumentParser) -> None:
         "--distortion", action="append", default=[], metavar="NAME=k1,k2,...", help="free coefficients; NAME=: none"
     )
     parser.add_argument("--fisheye", default="", metavar="NAME,...", help="cameras with the KB4 model")
+    add_known_options(parser)
     parser.add_argument("--flat", action="store_true", help="the board is not bent at all")
     parser.add_argument(
         "--pitch-sigma",
@@ -49,6 +51,7 @@ def read_by_options(args: argparse.Namespace) -> tuple[BoardViews, SolvePlan]:
     plan = _plan(args)
     folders = dict(zip(plan.cameras, args.folders, strict=True))
     views = read_board_views(folders, frame=args.frame)
+    plan = with_known(plan, args, views.sizes_px)
     if args.range is None and (args.amplitude is not None or args.modulation_mhz is not None):
         raise BadInputError("bad_arguments", "--amplitude and --modulation-mhz are of range images: add --range")
     if args.range is not None:

@@ -85,7 +85,9 @@ def _half(solution: Solution, frames: Sequence[str]) -> Solution:
         if isinstance(sensor.data, CornerData)
     }
     terms = None if solution.ranges is None else solution.ranges.terms
-    return solve_from(views, replace(solution.plan, range_terms=terms), state, scales)
+    # Known numbers count as in the whole: enlarged where the images contradict them.
+    known = solution.adjustment.problem.known
+    return solve_from(views, replace(solution.plan, range_terms=terms, known=known), state, scales)
 
 
 def _camera_parameters(solution: Solution) -> npt.NDArray[np.intp]:

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from cairn_calib.diagnosis.probe_points import Probes
-from cairn_calib.solve.normal_equations import Block, solve_scaled
+from cairn_calib.solve.normal_equations import frame_shares, solve_scaled
 from cairn_calib.solve.solution import Solution
-from cairn_map.arrays import Floats
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,25 +26,6 @@ class Influence:
     """Camera of that point."""
     sigmas: float
     """The most moved point in its own standard deviations, of any camera."""
-
-
-def frame_shares(blocks: list[Block], size: int, frame_count: int, *, floor: float = 0.0) -> tuple[Floats, Floats]:
-    """(F, P, P) and (F, P): each frame's part of the reduced normal equations, its board eliminated.
-
-    `floor` is added to the diagonal of each board's own block, so that a board that no camera sees has no effect.
-    """
-    A, a = np.zeros((frame_count, size, size)), np.zeros((frame_count, size))
-    B, C, b = np.zeros((frame_count, size, 6)), np.zeros((frame_count, 6, 6)), np.zeros((frame_count, 6))
-    for block in blocks:
-        k = len(block.at)
-        A[np.ix_(block.frames, block.at, block.at)] += block.square[:, :k, :k]
-        a[np.ix_(block.frames, block.at)] += block.pull[:, :k]
-        B[np.ix_(block.frames, block.at)] += block.square[:, :k, k:]
-        C[block.frames] += block.square[:, k:, k:]
-        b[block.frames] += block.pull[:, k:]
-    # Schur complement of each board's own block, as in `normal_equations.py`, but frame by frame.
-    solved = np.linalg.solve(C + floor * np.eye(6), np.concatenate([np.swapaxes(B, 1, 2), b[..., None]], axis=2))
-    return A - B @ solved[..., :-1], a - (B @ solved[..., -1:])[..., 0]
 
 
 def influences(solution: Solution, probes: list[Probes]) -> list[Influence]:
@@ -64,6 +44,9 @@ def influences(solution: Solution, probes: list[Probes]) -> list[Influence]:
             continue
         moves = [np.linalg.norm(each.rows @ step, axis=1) for each in probes]
         most = max(range(len(probes)), key=lambda n: float(moves[n].max()))
-        strongest = max(float((move / sigma).max()) for move, sigma in zip(moves, sigmas, strict=True))
+        # Where all is held nothing moves, and nothing is uncertain.
+        strongest = max(
+            float((move / np.maximum(sigma, 1e-12)).max()) for move, sigma in zip(moves, sigmas, strict=True)
+        )
         result.append(Influence(frame, float(moves[most].max()), probes[most].camera, strongest))
     return sorted(result, key=lambda each: -each.sigmas)

@@ -9,11 +9,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cairn_calib.diagnosis.frame_influence import frame_shares
 from cairn_calib.diagnosis.probe_points import Probes, image_grid
 from cairn_calib.rig.pose_vectors import rotation_from_vector
 from cairn_calib.solve.corner_residuals import CornerData, board_points, corner_block
-from cairn_calib.solve.normal_equations import Loss
+from cairn_calib.solve.normal_equations import Loss, frame_shares
 from cairn_calib.solve.rig_state import warp_shape
 from cairn_calib.solve.solution import Solution
 from cairn_map.arrays import Floats
@@ -126,7 +125,7 @@ def _shares(solution: Solution, poses: Floats) -> tuple[Floats, Floats]:
         kept = inside[frames]
         whitening = np.broadcast_to(np.eye(2) / sensor.data.sigma_px, (*kept.shape, 2, 2))
         data = CornerData(c, frames, np.zeros((*kept.shape, 2)), whitening, kept, sensor.data.sigma_px)
-        blocks.append(corner_block(data, state, solution.layout, board, Loss(sensor.scale, kept, np.inf)))
+        blocks.append(corner_block(data, state, solution.layout, board, Loss(sensor.whole_scale, kept, np.inf)))
     # The floor makes boards that hardly a camera sees solvable; they add nothing.
     shares, _ = frame_shares(blocks, solution.layout.size, len(poses), floor=1e-6)
     return seen, shares

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 
-from cairn_calib.diagnosis.solve_warnings import SolveWarning
+from cairn_calib.diagnosis.verdict import Rank, SolveWarning
 from cairn_calib.rig.range_terms import wave_period_m
 from cairn_calib.rig.rig import Spectrum
 from cairn_calib.solve.range_choice import AMPLITUDE_RATIO, HARMONICS, PERIOD_SHARE
@@ -47,7 +47,7 @@ def _of_none(solution: Solution) -> Iterator[SolveWarning]:
             text = "no range image shows what it adds to its ranges: give those of the same boards (--range)"
             if shown is not None:
                 text = f"what it adds to its ranges is not known: --range is of {shown}; solve this camera alone for it"
-            yield SolveWarning("range_bias", name, 0, 1, "range images", text)
+            yield SolveWarning("range_bias", name, 0, 1, "range images", text, Rank.NOTE)
 
 
 def _of_other_ranges(name: str, solution: Solution) -> Iterator[SolveWarning]:
@@ -57,7 +57,7 @@ def _of_other_ranges(name: str, solution: Solution) -> Iterator[SolveWarning]:
     noise_m = solution.adjustment.problem.sensors[-1].scale * used.sigma_m
     if noise_m > NOISE_M:
         text = "ranges miss the boards by far more than noise: are their images of other places of the board?"
-        yield SolveWarning("range_noise", name, noise_m, NOISE_M, "m", text)
+        yield SolveWarning("range_noise", name, noise_m, NOISE_M, "m", text, Rank.DECISIVE)
         return  # and its bias means nothing
     known = zip(used.terms.document_names, used.terms.sigmas, strict=False)  # nodes come last
     sigmas, worst = max((abs(values[name, each]) / sigma, each) for each, sigma in known)
@@ -78,7 +78,7 @@ def _of_waves(name: str, solution: Solution) -> Iterator[SolveWarning]:
             "the circular error of its ranges is left out, for its modulation frequency was not stated "
             "(--modulation-mhz)"
         )
-        yield SolveWarning("range_wiggle", name, 0, 1, "modulation frequencies", text)
+        yield SolveWarning("range_wiggle", name, 0, 1, "modulation frequencies", text, Rank.NOTE)
         return
     lost = [k for k in HARMONICS if k not in used.terms.harmonics]
     if lost:
@@ -91,7 +91,7 @@ def _of_waves(name: str, solution: Solution) -> Iterator[SolveWarning]:
             "left out: take boards from nearer to farther"
         )
         best = max(spans.period_share(modulation_hz, k) for k in lost)
-        yield SolveWarning("range_wiggle", name, best, PERIOD_SHARE, "of a wave's period", text)
+        yield SolveWarning("range_wiggle", name, best, PERIOD_SHARE, "of a wave's period", text, Rank.NOTE)
 
 
 def _of_amplitude(name: str, solution: Solution) -> Iterator[SolveWarning]:
@@ -100,11 +100,13 @@ def _of_amplitude(name: str, solution: Solution) -> Iterator[SolveWarning]:
         return
     if spans.amplitudes is None:
         text = "how its ranges depend on the amplitude is left out, for not all have an amplitude image (--amplitude)"
-        yield SolveWarning("range_amplitude", name, 0, 1, "amplitude images a range image", text)
+        yield SolveWarning("range_amplitude", name, 0, 1, "amplitude images a range image", text, Rank.NOTE)
         return
     low, _, high = spans.amplitudes
     text = f"board pixels have amplitudes of {low:.0f} to {high:.0f} only: how ranges depend on them is left out"
-    yield SolveWarning("range_amplitude", name, spans.amplitude_ratio, AMPLITUDE_RATIO, "highest over lowest", text)
+    yield SolveWarning(
+        "range_amplitude", name, spans.amplitude_ratio, AMPLITUDE_RATIO, "highest over lowest", text, Rank.NOTE
+    )
 
 
 def _of_pixels(name: str, solution: Solution) -> Iterator[SolveWarning]:
@@ -113,12 +115,14 @@ def _of_pixels(name: str, solution: Solution) -> Iterator[SolveWarning]:
         return
     if found.pairs < PAIRS_MIN:
         text = "hardly a pixel saw the board in two images: what each adds to its ranges of its own is not known"
-        yield SolveWarning("range_pixels", name, found.pairs, PAIRS_MIN, "pairs of ranges of one pixel", text)
+        yield SolveWarning(
+            "range_pixels", name, found.pairs, PAIRS_MIN, "pairs of ranges of one pixel", text, Rank.NOTE
+        )
     if found.offsets is not None and 1 - found.seen_share > UNSEEN_SHARE:
         text = (
             "the pixels differ in what they add to their ranges, and on many there never was a board: theirs is 0 +- "
             f"{1000 * found.offsets.unseen_sigma_m:.1f} mm; take boards all over its image"
         )
         yield SolveWarning(
-            "range_pixels", name, 1 - found.seen_share, UNSEEN_SHARE, "of the pixels without board", text
+            "range_pixels", name, 1 - found.seen_share, UNSEEN_SHARE, "of the pixels without board", text, Rank.NOTE
         )

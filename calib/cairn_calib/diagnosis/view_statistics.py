@@ -28,6 +28,8 @@ class Coverage:
     """Distance of the outermost corner from the image's middle, over that of the image's corner."""
     tilt_deg: float
     """Largest angle between two boards."""
+    lean_deg: float
+    """Largest angle of a board from facing the camera."""
     nearest_m: float
     """Distance of the nearest board's middle."""
     farthest_m: float
@@ -52,13 +54,16 @@ def coverage(solution: Solution, camera: str) -> Coverage:
     T_camera_rig = inverse(solution.state.T_rig_camera[solution.views.cameras.index(camera)])
     T_camera_board = T_camera_rig @ solution.state.T_rig_board[frames]
     board_middle = solution.views.board.points().mean(axis=0)
-    distances = np.linalg.norm(T_camera_board[:, :3, :3] @ board_middle + T_camera_board[:, :3, 3], axis=1)
+    middles = T_camera_board[:, :3, :3] @ board_middle + T_camera_board[:, :3, 3]
+    distances = np.linalg.norm(middles, axis=1)
+    facing = np.einsum("fi,fi->f", T_camera_board[:, :3, 2], middles) / distances
     return Coverage(
         camera,
         len(views),
         counts.astype(np.intp),
         float(np.linalg.norm(pixels - middle, axis=1).max() / np.linalg.norm(middle)),
         tilt_range_deg(T_camera_board),
+        float(np.degrees(np.arccos(np.clip(facing.min(), -1, 1)))),
         float(distances.min()),
         float(distances.max()),
     )

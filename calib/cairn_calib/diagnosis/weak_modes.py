@@ -68,6 +68,8 @@ def weak_modes(solution: Solution, probes: Sequence[Probes]) -> list[WeakMode]:
     root = sigmas[:, None] * vectors * np.sqrt(np.maximum(values, 0))
     modes = []
     for each in probes:
+        if not each.rows.any():
+            continue  # all of this camera is held
         # covariance = root root^T; the mode is the direction of largest G root, back in parameters.
         G = each.rows.reshape(-1, len(sigmas)) @ root
         strengths, directions = np.linalg.eigh(G.T @ G / len(G))

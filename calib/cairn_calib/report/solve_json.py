@@ -5,7 +5,8 @@
      "cameras": {"tof": {"tilt_deg": 54.1, "images": [{"frame": "000003", "rms_px": 0.1, "outliers": 0}, ...], ...}},
      "ranges": {"camera": "tof", "nearest_m": 1.1, "harmonics": [4], "pixels": {"pattern_sigma_m": 0.006, ...}, ...},
      "halves": {...}, "influences": [...], "weak_modes": [...], "next_images": [...],
-     "radiometry": {"thermal": null}, "warnings": [...]}
+     "radiometry": {"thermal": null}, "verdict": {"usable": true, "text": "usable: ..."}, "known": [...],
+     "warnings": [{"rank": "note", "kind": "edge", ...}, ...]}
 
 An owner "" is the board: warp_x and warp_y in metres, scale of its pitch. Parameters of a pose are errors: value 0.
 Radiometry is of every thermal camera, as in rig.json; null: not radiometric.
@@ -24,6 +25,7 @@ from cairn_calib.report.range_report import ranges_json
 from cairn_calib.report.report_radiometry import radiometry_json
 from cairn_calib.report.validity import validity
 from cairn_calib.rig.calibration import unit_of
+from cairn_calib.solve.known_fit import KnownFit
 from cairn_calib.solve.rig_state import WARP
 
 FORMAT = "cairn-calibration-report"
@@ -59,9 +61,25 @@ def examination_json(seen: Examination) -> bytes:
         "weak_modes": [asdict(each) for each in seen.modes],
         "next_images": [{**asdict(each), "text": str(each)} for each in seen.next_images],
         "radiometry": radiometry_json(seen.rig),
-        "warnings": [asdict(each) for each in seen.warnings],
+        "verdict": {"usable": seen.verdict.is_usable, "text": str(seen.verdict)},
+        "known": [_known(each) for each in solution.known],
+        "warnings": [{**asdict(each), "rank": each.rank.name.lower()} for each in seen.warnings],
     }
     return json.dumps(_finite(document), indent=1, allow_nan=False).encode() + b"\n"
+
+
+def _known(fit: KnownFit) -> dict[str, object]:
+    return {
+        "camera": fit.known.camera,
+        "source": fit.known.source,
+        "names": list(fit.known.names),
+        "stated": fit.known.values.tolist(),
+        "stated_sigmas": np.sqrt(np.diag(fit.known.covariance)).tolist(),
+        "solved": fit.values.tolist(),
+        "sigmas_off": fit.sigmas_off.tolist(),
+        "together_off": fit.together,
+        "enlarged": fit.scale,
+    }
 
 
 def _camera(seen: Examination, name: str) -> dict[str, object]:
@@ -77,6 +95,7 @@ def _camera(seen: Examination, name: str) -> dict[str, object]:
     }
     return {
         "tilt_deg": covered.tilt_deg,
+        "lean_deg": covered.lean_deg,
         "nearest_m": covered.nearest_m,
         "farthest_m": covered.farthest_m,
         "radius_share": covered.radius_share,

@@ -7,6 +7,7 @@ import numpy as np
 
 from cairn_calib.diagnosis.examination import Examination
 from cairn_calib.diagnosis.probe_points import RANGES_M
+from cairn_calib.diagnosis.verdict import merged
 from cairn_calib.diagnosis.view_statistics import ViewResiduals, view_residuals
 from cairn_calib.diagnosis.world_uncertainty import sigma_map, transfer_map
 from cairn_calib.report.image_overlays import coverage_picture, heat_legend, heat_map, quiver
@@ -14,7 +15,14 @@ from cairn_calib.report.page import Figure, Table, page
 from cairn_calib.report.range_report import range_facts
 from cairn_calib.report.report_images import ReportImage, image_figures
 from cairn_calib.report.report_radiometry import radiometry_facts
-from cairn_calib.report.solve_tables import board_table, image_table, lens_table, place_table, statistics_table
+from cairn_calib.report.solve_tables import (
+    board_table,
+    image_table,
+    lens_table,
+    place_table,
+    plus_minus,
+    statistics_table,
+)
 from cairn_calib.report.straight_lines import straight_figure
 from cairn_calib.report.validity import validity, validity_figure, validity_rows
 from cairn_calib.rig.projection_uncertainty import mounted_lens
@@ -33,7 +41,9 @@ def report_page(seen: Examination, images: Mapping[str, Sequence[ReportImage]] |
         "solve.html",
         rig=seen.rig.name,
         head=_head(seen),
-        warnings=seen.warnings,
+        verdict=str(seen.verdict),
+        warnings=merged(seen.warnings),
+        known=_known(seen),
         next_images=seen.next_images,
         lenses=lens_table(seen),
         places=place_table(seen),
@@ -107,7 +117,7 @@ def _camera(
         "coverage": Figure(
             coverage_picture(size, covered, corners, seen.next_images),
             f"Corners of {covered.images} images; {covered.cell_share:.0%} of the parts covered, tilted by up to "
-            f"{covered.tilt_deg:.0f} degrees, {covered.nearest_m:.2f} to {covered.farthest_m:.2f} m away",
+            f"{covered.lean_deg:.0f} degrees, {covered.nearest_m:.2f} to {covered.farthest_m:.2f} m away",
         ),
         "maps": maps,
     }
@@ -128,6 +138,22 @@ def _halves(seen: Examination) -> dict[str, object] | None:
     ]
     table = Table(["camera", "difference, px", "expected, px", "ratio"], rows)
     return {"parameters": seen.halves.parameters, "chi2": seen.halves.chi2, "table": table}
+
+
+def _known(seen: Examination) -> Table | None:
+    rows = [
+        [
+            f"{fit.known.camera}: {fit.known.source}",
+            name,
+            plus_minus(float(fit.known.values[n]), float(np.sqrt(fit.known.covariance[n, n]))),
+            f"{fit.values[n]:.6g}",
+            f"{fit.sigmas_off[n]:.1f}",
+            f"{fit.scale:.1f}" if fit.scale > 1 else "",
+        ]
+        for fit in seen.solution.known
+        for n, name in enumerate(fit.known.names)
+    ]
+    return Table(["known before", "", "stated", "solved", "sigmas off", "its sigma enlarged"], rows) if rows else None
 
 
 def _influences(seen: Examination) -> Table:

@@ -129,6 +129,9 @@ class Statistics(BaseModel):
     chi2: Positive
     degrees_of_freedom: Count
     cameras: Annotated[dict[Name, CameraStatistics], Field(max_length=32)]
+    scatter: Annotated[float, Field(ge=1, allow_inf_nan=False)] | None = None
+    """Variance by which images disagree, over that which the noise of their corners explains; the covariance has been
+    enlarged by it. None: noise explains all."""
 
 
 class InputFile(BaseModel):

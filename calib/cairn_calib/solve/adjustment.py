@@ -16,8 +16,8 @@ from cairn_calib.board.board import Board
 from cairn_calib.solve.corner_residuals import CornerData, corner_block
 from cairn_calib.solve.normal_equations import Block, Loss, NormalEquations, Uncertainty, sum_blocks, uncertainty
 from cairn_calib.solve.range_residuals import RangeData, range_block
-from cairn_calib.solve.rig_state import ParameterLayout, RigState, shared_values, step_state, warp_shape
-from cairn_calib.solve.solve_plan import NoisePlan, Prior
+from cairn_calib.solve.rig_state import ParameterLayout, RigState, known_values, step_state, warp_shape
+from cairn_calib.solve.solve_plan import KnownNumbers, NoisePlan, Prior
 from cairn_map.arrays import Flags, Floats
 
 STEPS_MAX = 100
@@ -47,11 +47,18 @@ class Sensor:
     """Estimated noise over the stated one."""
     kept: Flags
     """(V, N) True for each point that counts: measured, and no outlier."""
+    scatter: float = 1.0
+    """Variance by which frames disagree, over that which `scale` explains; residuals weigh by both."""
 
     @property
     def there(self) -> Flags:
         """(V, N) True for each point that was measured."""
         return self.data.seen if isinstance(self.data, CornerData) else self.data.measured
+
+    @property
+    def whole_scale(self) -> float:
+        """Noise and scatter of frames together, over the stated noise."""
+        return self.scale * float(np.sqrt(self.scatter))
 
     @property
     def axes(self) -> int:
@@ -67,13 +74,15 @@ class AdjustmentProblem:
     layout: ParameterLayout
     sensors: tuple[Sensor, ...]
     priors: tuple[Prior, ...]
+    known: tuple[KnownNumbers, ...] = ()
+    """Numbers that were known before."""
 
     def blocks(self, state: RigState, *, huber_sigmas: float = np.inf) -> list[Block]:
         """Blocks of the normal equations at a state, one for each sensor."""
         board = (self.board.points(), warp_shape(self.board))
         blocks = []
         for sensor in self.sensors:
-            loss = Loss(sensor.scale, sensor.kept, huber_sigmas)
+            loss = Loss(sensor.whole_scale, sensor.kept, huber_sigmas)
             if isinstance(sensor.data, CornerData):
                 blocks.append(corner_block(sensor.data, state, self.layout, board, loss))
             else:
@@ -84,8 +93,8 @@ class AdjustmentProblem:
         """Normal equations at a state: the sum of all blocks and of the priors."""
         normal = sum_blocks(blocks, self.layout.size, len(state.T_rig_board))
         A, a, cost = normal.A.copy(), normal.a.copy(), normal.cost
-        values = shared_values(state, self.layout)
-        for prior in self.priors:
+        values = known_values(state, self.layout)
+        for prior in (*self.priors, *(prior for each in self.known for prior in each.priors())):
             # A prior is one more residual, (row . values - value) / sigma.
             row = self.prior_row(prior)
             miss = float(row @ values - prior.value) / prior.sigma

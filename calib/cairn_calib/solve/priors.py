@@ -47,11 +47,16 @@ def usual_priors(
     if plan.usual_priors:
         for name, camera in plan.cameras.items():
             # With few views all coefficients and the principal point are held near usual values, and fx near fy.
-            known = _usual_sigmas(camera)
+            usual = _usual_sigmas(camera)
             if view_counts[name] < FEW_VIEWS:
-                priors += _few_view_priors(name, lenses[name])
-                known = {each: known.get(each, FEW_SIGMAS.get(each)) for each in camera.coefficients}
-            priors += [single_prior(name, each, 0.0, sigma) for each, sigma in known.items() if sigma is not None]
+                priors += _few_view_priors(name, lenses[name], camera)
+                usual = {each: usual.get(each, FEW_SIGMAS.get(each)) for each in camera.coefficients}
+            # What is known of this very camera counts instead of what is usual.
+            priors += [
+                single_prior(name, each, 0.0, sigma)
+                for each, sigma in usual.items()
+                if sigma is not None and each not in camera.known
+            ]
         if plan.warp:
             # The board: warp near 0, pitch near the stated one.
             side = float(np.ptp(board.points(), axis=0).max())
@@ -62,7 +67,7 @@ def usual_priors(
         # The range bias: each shape near 0.
         owner, terms = ranges
         priors += [single_prior(owner, name, 0.0, sigma) for name, sigma in zip(terms.names, terms.sigmas, strict=True)]
-    return (*priors, *plan.priors)
+    return tuple(priors)
 
 
 def single_prior(owner: str, name: str, value: float, sigma: float) -> Prior:
@@ -82,8 +87,10 @@ def _usual_sigmas(camera: CameraPlan) -> dict[str, float | None]:
     return known | ({"k2": RANGE_K2_SIGMA} if camera.spectrum is Spectrum.RANGE and "k2" in free else {})
 
 
-def _few_view_priors(name: str, lens: Lens) -> list[Prior]:
-    cx, cy = (lens.width - 1) / 2, (lens.height - 1) / 2
+def _few_view_priors(name: str, lens: Lens, camera: CameraPlan) -> list[Prior]:
+    middle = {"cx": (lens.width - 1) / 2, "cy": (lens.height - 1) / 2}
     sigma = CENTRE_SIGMA * lens.width
-    aspect = Prior(((name, "fx", 1.0), (name, "fy", -1.0)), 0.0, ASPECT_SIGMA * lens.focal_px[0])
-    return [single_prior(name, "cx", cx, sigma), single_prior(name, "cy", cy, sigma), aspect]
+    priors = [single_prior(name, each, value, sigma) for each, value in middle.items() if each not in camera.known]
+    if not {"fx", "fy"} & set(camera.known):
+        priors.append(Prior(((name, "fx", 1.0), (name, "fy", -1.0)), 0.0, ASPECT_SIGMA * lens.focal_px[0]))
+    return priors

@@ -84,7 +84,7 @@ def parameter_layout(
     columns, intrinsic_at, pose_at = [], [], []
     for name, camera in plan.cameras.items():
         every = lenses[name].intrinsic_names
-        free = [each for each in every if each in ("fx", "fy", "cx", "cy", *camera.coefficients)]
+        free = [each for each in every if camera.is_free(each)]
         columns.append(np.array([every.index(each) for each in free], np.intp))
         intrinsic_at.append(claim(name, free))
         pose_at.append(claim(name, [] if name == plan.gauge else list(POSE_UNITS)))
@@ -112,6 +112,14 @@ def shared_values(state: RigState, layout: ParameterLayout) -> Floats:
     values[layout.warp_at] = state.warp_m[: len(layout.warp_at)]
     values[layout.scale_at] = state.scale
     values[layout.bias_at] = state.bias
+    return values
+
+
+def known_values(state: RigState, layout: ParameterLayout) -> Floats:
+    """`shared_values` with each camera's place (metres, rig frame) instead of the errors 0 of its translation."""
+    values = shared_values(state, layout)
+    for T, at in zip(state.T_rig_camera, layout.pose_at, strict=True):
+        values[at[3:]] = T[:3, 3][: len(at[3:])]
     return values
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from cairn_calib.solve.adjustment import Adjustment
 from cairn_calib.solve.board_views import BoardViews
+from cairn_calib.solve.known_fit import KnownFit
 from cairn_calib.solve.normal_equations import Uncertainty
 from cairn_calib.solve.pixel_pattern import PixelPattern
 from cairn_calib.solve.range_choice import RangeSpans
@@ -33,6 +34,10 @@ class Solution:
     """Distances and amplitudes that the range images covered; None without range images."""
     pattern: PixelPattern | None = None
     """Range offset of each pixel of the range camera; None where it was not estimated."""
+    scatter: float = 1.0
+    """Variance by which frames disagree, over that which the noise of their corners explains; part of `uncertainty`."""
+    known: tuple[KnownFit, ...] = ()
+    """Fit of each of the plan's known numbers to the images."""
 
     @property
     def ranges(self) -> RangeData | None:

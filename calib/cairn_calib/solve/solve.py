@@ -8,6 +8,8 @@
 6. corners and ranges together, with that range bias                                 range_residuals.py
 7. if the plan asks for it: a grid of nodes in the range bias                        range_nodes.py
 8. each pixel's own offset; where these are smooth, stage 7 and this one again       pixel_pattern.py
+9. noise with the scatter of frames, where that is more than corners explain         normal_equations.py
+10. numbers known before, whose sigmas are enlarged where the images contradict them  known_fit.py
 
 `solve_rig` runs all of them, `solve_from` stages 4 to 7 from a known state. Each of 4, 6 and 7 begins at the minimum of
 the one before; 7 keeps its outliers and noise. `solved_rig.py` makes rig.json, with its covariance, of the solution.
@@ -23,11 +25,12 @@ from dataclasses import replace
 import numpy as np
 
 from cairn_calib.rig.range_terms import NODE_SIGMA_M, RangeTerms
-from cairn_calib.solve.adjustment import Adjustment, AdjustmentProblem, Sensor, adjust, resume
+from cairn_calib.solve.adjustment import WARM, Adjustment, AdjustmentProblem, Sensor, adjust, descend, resume
 from cairn_calib.solve.board_views import BoardViews
 from cairn_calib.solve.camera_alone import camera_alone
 from cairn_calib.solve.corner_residuals import corner_data
-from cairn_calib.solve.normal_equations import uncertainty
+from cairn_calib.solve.known_fit import fit_known
+from cairn_calib.solve.normal_equations import frame_scatter, uncertainty
 from cairn_calib.solve.pixel_pattern import pixel_pattern
 from cairn_calib.solve.priors import single_prior, usual_priors
 from cairn_calib.solve.range_choice import choose_terms, range_spans
@@ -36,7 +39,7 @@ from cairn_calib.solve.range_residuals import RangeData, range_data
 from cairn_calib.solve.rig_start import first_state, rig_start
 from cairn_calib.solve.rig_state import RigState, parameter_layout
 from cairn_calib.solve.solution import Solution
-from cairn_calib.solve.solve_plan import Prior, SolvePlan
+from cairn_calib.solve.solve_plan import FOCAL_AND_CENTRE, Prior, SolvePlan
 from cairn_calib.solve.zhang import homography_of
 from cairn_map.errors import BadInputError
 
@@ -44,6 +47,8 @@ SMOOTH_M = 5e-4
 """Smooth part of the pixels' own offsets, metres, from which a grid of nodes is solved for: half a millimetre."""
 RANGE_SIGMA_M = 0.01
 """Stated noise of a range, metres; the scale of noise that is estimated with the rig corrects it."""
+SCATTER_SIGMAS = 3.0
+"""Standard deviations by which the scatter of frames must exceed what noise explains, to count."""
 
 
 def solve_rig(views: BoardViews, plan: SolvePlan) -> Solution:
@@ -56,6 +61,9 @@ def solve_rig(views: BoardViews, plan: SolvePlan) -> Solution:
         raise BadInputError(
             "unknown_camera", f"the plan is of {', '.join(plan.cameras)}, the views of {', '.join(views.cameras)}"
         )
+    for name, camera in plan.cameras.items():
+        if len(plan.cameras) == 1 and not any(map(camera.is_free, (*FOCAL_AND_CENTRE, *camera.coefficients))):
+            raise BadInputError("bad_arguments", f"all of {name} is held, and it is alone: nothing is left to solve")
     # Corners on a line leave a board's place open.
     views = views.without((each.camera, each.frame) for each in views.views if homography_of(each.corners) is None)
     # 1. Each camera alone.
@@ -69,8 +77,8 @@ def solve_rig(views: BoardViews, plan: SolvePlan) -> Solution:
     state = first_state(views, alone, start.T_rig_camera)
     # 4 to 7. Everything together.
     solution = solve_from(views, plan, state, {name: each.scale for name, each in alone.items()})
-    # 8. Each pixel's own offset.
-    return replace(_with_pixels(solution), reversed_views=start.reversed_views)
+    # 8 to 10. Each pixel's own offset; the scatter of frames, and what contradicts what was known.
+    return replace(_with_scatter(_with_pixels(solution)), reversed_views=start.reversed_views)
 
 
 def solve_from(views: BoardViews, plan: SolvePlan, state: RigState, scales: Mapping[str, float]) -> Solution:
@@ -109,7 +117,9 @@ def _solve_corners(views: BoardViews, plan: SolvePlan, state: RigState, scales: 
     layout = parameter_layout(plan, dict(zip(plan.cameras, state.lenses, strict=True)), [])
     priors = _priors(views, plan, state, ranges=None)
     return _adjust(
-        AdjustmentProblem(views.board, layout, tuple(sensors), priors), replace(state, bias=np.zeros(0)), plan
+        AdjustmentProblem(views.board, layout, tuple(sensors), priors, plan.known),
+        replace(state, bias=np.zeros(0)),
+        plan,
     )
 
 
@@ -123,7 +133,7 @@ def _solve_ranges(
     layout = parameter_layout(plan, lenses, [(owner, name) for name in terms.names])
     ranged = ranged.with_terms(terms, state.lenses[ranged.camera])
     sensors = (*by_corners.problem.sensors, Sensor(ranged, 1.0, ranged.measured))
-    problem = AdjustmentProblem(board, layout, sensors, priors)
+    problem = AdjustmentProblem(board, layout, sensors, priors, plan.known)
     return _adjust(problem, replace(state, bias=np.zeros(len(terms.names))), plan)
 
 
@@ -143,7 +153,8 @@ def _solve_nodes(adjusted: Adjustment, plan: SolvePlan) -> Adjustment:
     sensors = (*corners, replace(last, data=last.data.with_terms(terms, lens)))
     state = replace(adjusted.state, bias=np.append(adjusted.state.bias, np.zeros(len(added))))
     try:
-        return resume(AdjustmentProblem(adjusted.problem.board, layout, sensors, priors), state, plan.noise)
+        problem = replace(adjusted.problem, layout=layout, sensors=sensors, priors=priors)
+        return resume(problem, state, plan.noise)
     except np.linalg.LinAlgError as exc:
         raise BadInputError("not_observable", f"the images do not determine the range bias ({exc}): take more") from exc
 
@@ -158,13 +169,50 @@ def _with_pixels(solution: Solution) -> Solution:
     return replace(solution, pattern=pattern)
 
 
+def _with_scatter(solution: Solution) -> Solution:
+    """Stages 9 and 10: the minimum and a covariance for frames that disagree, and numbers that they contradict."""
+    if solution.plan.noise.rounds == 0:
+        return solution
+    done = solution.adjustment
+    try:
+        done, fits = fit_known(_scattered(done))
+        if any(fit.contradicts for fit in fits):
+            # Outliers and noise were judged while wrong numbers pulled at all: again, with what these are worth.
+            sensors = tuple(replace(each, scatter=1.0) for each in done.problem.sensors)
+            again = adjust(replace(done.problem, sensors=sensors), done.state, solution.plan.noise)
+            done, fits = fit_known(_scattered(again))
+        known = uncertainty(done.normal)
+    except np.linalg.LinAlgError as exc:
+        raise _open(exc) from exc
+    scatter = done.problem.sensors[0].scatter
+    return replace(solution, adjustment=done, uncertainty=known, scatter=scatter, known=fits)
+
+
+def _scattered(done: Adjustment) -> Adjustment:
+    """The minimum with residuals that weigh by the scatter of frames as well, if that is more than noise."""
+    problem = done.problem
+    try:
+        # Where the images alone are at rest: what is known pulls all frames to one side.
+        ratio, sigma = frame_scatter(done.blocks, replace(problem, known=()).normal(done.state, done.blocks))
+    except np.linalg.LinAlgError:
+        ratio, sigma = frame_scatter(done.blocks, done.normal)
+    if ratio < 1 + SCATTER_SIGMAS * sigma:
+        return done
+    sensors = tuple(replace(each, scatter=ratio) for each in problem.sensors)
+    return descend(replace(problem, sensors=sensors), done.state, damping=WARM)
+
+
 def _adjust(problem: AdjustmentProblem, state: RigState, plan: SolvePlan) -> Adjustment:
     try:
         return adjust(problem, state, plan.noise)
     except np.linalg.LinAlgError as exc:
-        raise BadInputError(
-            "not_observable", f"the images do not determine all of the rig ({exc}): take more, with the board tilted"
-        ) from exc
+        raise _open(exc) from exc
+
+
+def _open(exc: np.linalg.LinAlgError) -> BadInputError:
+    return BadInputError(
+        "not_observable", f"the images do not determine all of the rig ({exc}): take more, with the board tilted"
+    )
 
 
 def _priors(

@@ -15,16 +15,19 @@ A prior is a pseudo-observation: a sum of numbers times coefficients is a value,
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Self
 
 import numpy as np
 
 from cairn_calib.rig.range_terms import RangeTerms
 from cairn_calib.rig.rig import Spectrum
+from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
 
 PINHOLE = ("k1", "k2", "p1", "p2", "k3")
 FISHEYE = ("k1", "k2", "k3", "k4")
 BROWN = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+FOCAL_AND_CENTRE = ("fx", "fy", "cx", "cy")
 SHARED = ""
 """The owner of what belongs to no camera: the board's warp and scale."""
 PITCH_SIGMA = 2e-4
@@ -40,6 +43,43 @@ class Prior:
     sigma: float
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class KnownNumbers:
+    """Numbers of one camera that were known before the images: a data sheet's, a factory's, or last year's."""
+
+    camera: str
+    source: str
+    """Origin, for people."""
+    names: tuple[str, ...]
+    """K intrinsics, or `tx`, `ty`, `tz`: its place in the rig's frame, metres."""
+    values: Floats
+    """(K,)"""
+    covariance: Floats
+    """(K, K) of their errors, positive definite."""
+    scale: float = 1.0
+    """Factor of the standard deviations, above 1 where the images contradict them."""
+
+    @classmethod
+    def single(cls, camera: str, source: str, name: str, value: float, sigma: float) -> Self:
+        """One number and its standard deviation."""
+        return cls(camera, source, (name,), np.array([value]), np.array([[sigma**2]]))
+
+    def priors(self) -> tuple[Prior, ...]:
+        """Independent priors that say the same: W (x - values) = 0 +- scale with W^T W the covariance's inverse."""
+        sigmas = np.sqrt(np.diag(self.covariance))
+        # Scaled to correlations; one of 1 - 1e-10 is as good as 1, whatever rounding made of it.
+        strengths, axes = np.linalg.eigh(self.covariance / sigmas[:, None] / sigmas)
+        rows = (axes / np.sqrt(np.maximum(strengths, 1e-10))).T / sigmas
+        return tuple(
+            Prior(
+                tuple((self.camera, name, float(each)) for name, each in zip(self.names, row, strict=True)),
+                float(row @ self.values),
+                self.scale,
+            )
+            for row in rows
+        )
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraPlan:
     """Plan of one camera: its spectrum, its model, and the coefficients that are free."""
@@ -49,6 +89,10 @@ class CameraPlan:
     """`pinhole` or `kb4`."""
     free: tuple[str, ...] | None = None
     """Names of free distortion coefficients; None: as usual for the model."""
+    known: Mapping[str, float] = field(default_factory=dict)
+    """Values of intrinsics that were known before: the solve starts there."""
+    held: tuple[str, ...] = ()
+    """Names of intrinsics that stay as they are known."""
 
     def __post_init__(self) -> None:
         if self.model not in ("pinhole", "kb4"):
@@ -60,9 +104,14 @@ class CameraPlan:
     @property
     def coefficients(self) -> tuple[str, ...]:
         """Names of the free distortion coefficients."""
-        if self.free is not None:
-            return self.free
-        return FISHEYE if self.model == "kb4" else PINHOLE
+        free = self.free
+        if free is None:
+            free = FISHEYE if self.model == "kb4" else PINHOLE
+        return tuple(name for name in free if name not in self.held)
+
+    def is_free(self, name: str) -> bool:
+        """True for each intrinsic that the solve changes."""
+        return name in self.coefficients or (name in FOCAL_AND_CENTRE and name not in self.held)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -93,8 +142,8 @@ class SolvePlan:
     """Relative standard deviation of the board's pitch; 0: exact."""
     warp: bool = True
     """True if the board may be bent: a parabola along x and one along y."""
-    priors: tuple[Prior, ...] = ()
-    """Priors besides the usual ones."""
+    known: tuple[KnownNumbers, ...] = ()
+    """Numbers that were known before the images, besides what is usual."""
     usual_priors: bool = True
     """True if the priors that few views or a coarse sensor need are added."""
     noise: NoisePlan = field(default_factory=NoisePlan)

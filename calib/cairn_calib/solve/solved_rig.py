@@ -71,8 +71,16 @@ def statistics_of(solution: Solution) -> Statistics:
                 sigma_px=float(sensor.scale * sensor.data.sigma_px),
             )
     unknown = solution.layout.size + 6 * len(solution.state.T_rig_board)
-    freedom = count + len(solution.adjustment.problem.priors) - unknown
-    return Statistics(chi2=solution.adjustment.normal.cost, degrees_of_freedom=max(freedom, 0), cameras=cameras)
+    problem, scatter = solution.adjustment.problem, solution.scatter
+    freedom = count + len(problem.priors) + sum(len(each.names) for each in problem.known) - unknown
+    # By the noise of the corners alone, without the scatter of frames.
+    chi2 = solution.adjustment.normal.cost + (scatter - 1) * sum(block.cost for block in solution.adjustment.blocks)
+    return Statistics(
+        chi2=chi2,
+        degrees_of_freedom=max(freedom, 0),
+        cameras=cameras,
+        scatter=solution.scatter if solution.scatter > 1 else None,
+    )
 
 
 def _version() -> str:

@@ -88,9 +88,13 @@ def test_another_rig_or_other_corners_are_refused(solved: tuple[Path, list[str]]
 def test_a_report_never_overwrites_its_rig(solved: tuple[Path, list[str]]) -> None:
     folder, paths = solved
     before = (folder / "rig.json").read_bytes()
-    options = ["--output", str(folder / "rig.json"), "--report", str(folder / "rig.html")]
-    with pytest.raises(BadInputError, match="name the report otherwise"):
-        main(["solve", *paths, "--spectrum", "tof=range,thermal-left=thermal", *options])
-    with pytest.raises(BadInputError, match="name the report otherwise"):
-        main(["report", str(folder / "rig.json"), *paths, "--output", str(folder / "rig.html")])
+    with pytest.raises(BadInputError, match=r"would replace .*rig.json: name it otherwise"):
+        main(["report", str(folder / "rig.json"), *paths, "--output", str(folder / "rig.json")])
+    # The page rig.html next to rig.json has its numbers in rig-report.json.
+    assert main(["report", str(folder / "rig.json"), *paths, "--output", str(folder / "rig.html")]) == 0
+    assert json.loads((folder / "rig-report.json").read_text())["format"] == "cairn-calibration-report"
+    options = ["--output", str(folder / "again.json"), "--report", str(folder / "again.html")]
+    assert main(["solve", *paths, "--spectrum", "tof=range,thermal-left=thermal", *options]) == 0
+    assert load_rig(folder / "again.json").name == "rig"
+    assert json.loads((folder / "again-report.json").read_text())["verdict"]["usable"]
     assert (folder / "rig.json").read_bytes() == before

@@ -37,8 +37,9 @@ def test_folders_of_corners_become_a_rig_and_a_report(tmp_path: Path, capsys: py
     told = capsys.readouterr()
     assert re.search(r"left +8 images +\d+ points +0 outliers +noise 0\.1", told.out)
     assert re.search(r"tof ranges: 8 images +\d+ pixels.*, amplitude; pixels differ by \d\.\d mm", told.out)
-    assert "warning: tof: no corner lies near the image's corners" in told.err
-    assert re.search(r"warning: tof: board pixels from .* of wave 4 of its circular error, left out", told.err)
+    assert re.search(r"^usable: where a pixel of tof appears in left is known to 0\.\d+ px", told.out, re.MULTILINE)
+    assert "note: tof: no corner lies near the image's corners" in told.err
+    assert re.search(r"note: tof: board pixels from .* of wave 4 of its circular error, left out", told.err)
     rig = load_rig(tmp_path / "rig.json")
     assert rig["tof"].spectrum is Spectrum.RANGE
     assert rig["left"].transform[:3, 3] == pytest.approx(truth.T_rig_camera("left")[:3, 3], abs=0.02)

@@ -12,12 +12,15 @@ from tests.fixtures.calib.simulated_views import SPECTRA, exact_pixels, views_of
 from cairn_calib.board.corners import Corners
 from cairn_calib.diagnosis.cross_validation import cross_validate
 from cairn_calib.diagnosis.examination import Examination, examine
+from cairn_calib.diagnosis.frame_influence import Influence
 from cairn_calib.diagnosis.next_image import NextImage
 from cairn_calib.diagnosis.probe_points import probes_of
-from cairn_calib.diagnosis.solve_warnings import SolveWarning, refuse_undetermined, warnings_of
+from cairn_calib.diagnosis.solve_warnings import refuse_undetermined, warnings_of
+from cairn_calib.diagnosis.verdict import Rank, SolveWarning, merged, ranked, verdict_of
 from cairn_calib.diagnosis.view_statistics import coverage
 from cairn_calib.diagnosis.world_uncertainty import pixel_covariance, world_covariance
 from cairn_calib.rig.projection_uncertainty import project_certain, transfer_certain
+from cairn_calib.solve.adjustment import Adjustment, Sensor
 from cairn_calib.solve.board_views import BoardView
 from cairn_calib.solve.rig_state import step_state
 from cairn_calib.solve.solution import Solution
@@ -196,7 +199,10 @@ def test_warnings_name_what_the_images_lack() -> None:
     assert "prior" in {each.kind for each in told}
     weak = next(each for each in told if each.kind == "weak_mode" and each.camera == "tof")
     assert weak.measured > weak.threshold == 1
-    assert re.match(r".*fx.* of tof.* are open together: a longer lens looks like a farther board", weak.text)
+    told = (
+        r"points may be off by .* px, for .*fx.* of tof.* are open together: a longer lens looks like a farther board"
+    )
+    assert re.match(told, weak.text)
     few = world(4, seed=1, names=PAIR, tilt_deg=25.0)
     solution = solve_rig(views_of(few, seed=1), PLAN)
     told = examine(solution, solved_rig(solution, made_s=0.0)).warnings
@@ -218,7 +224,7 @@ def test_warnings_name_corners_that_do_not_fit(solution: Solution) -> None:
 
 
 def told_of(solution: Solution) -> Sequence[SolveWarning]:
-    return warnings_of(solution, [], [], None, [])
+    return warnings_of(solution, [], [], None, [], [], [])
 
 
 def test_coverage_counts_corners_by_part_of_the_image(solution: Solution) -> None:
@@ -230,14 +236,52 @@ def test_coverage_counts_corners_by_part_of_the_image(solution: Solution) -> Non
 
 
 def test_a_focal_length_that_is_open_is_refused(solution: Solution) -> None:
-    refuse_undetermined(solution)
+    refuse_undetermined(solution, [])
     at = solution.layout.index("left", "fx")
     assert at is not None
     covariance = solution.covariance.copy()
     covariance[at, at] = (0.3 * 1330) ** 2
     open_ = replace(solution, uncertainty=replace(solution.uncertainty, shared=covariance))
-    with pytest.raises(BadInputError, match=r"focal length of left open: 13.. px, give or take 30%"):
-        refuse_undetermined(open_)
+    with pytest.raises(BadInputError, match=r"focal length of left open \(its standard deviation is 30% of it"):
+        refuse_undetermined(open_, [])
+
+
+def test_a_rig_that_hangs_on_one_frame_is_refused(solution: Solution) -> None:
+    with pytest.raises(BadInputError, match="without frame 003 nothing determines the rig") as found:
+        refuse_undetermined(solution, [Influence("003", np.inf, "tof", np.inf)])
+    assert found.value.kind == "not_observable"
+
+
+def test_the_weightiest_warning_comes_first_and_notes_of_one_kind_are_one() -> None:
+    notes = [
+        SolveWarning("edge", name, share, 0.8, "", "no corner", Rank.NOTE) for name, share in (("a", 0.7), ("b", 0.5))
+    ]
+    care = [SolveWarning("outliers", "a", share, 0.05, "", f"{share}") for share in (0.1, 0.2)]
+    worst = SolveWarning("noise", "b", 9.0, 1.0, "px", "corners miss", Rank.DECISIVE)
+    order = ranked([*notes, *care, worst])
+    assert [(each.kind, each.camera) for each in order[1:]] == [*[("outliers", "a")] * 2, ("edge", "b"), ("edge", "a")]
+    assert [each.text for each in merged(order)] == ["corners miss", "0.2", "0.1", "no corner (likewise a)"]
+    assert str(verdict_of(order, "fine")) == "not usable: b: corners miss"
+    assert not verdict_of(order, "fine").is_usable
+    assert str(verdict_of(order[1:], "fine")) == "usable with care: a: 0.2"
+    assert [str(verdict_of(each, "fine")) for each in (order[3:], [])] == ["usable: fine"] * 2
+
+
+def test_what_makes_a_solution_useless_says_so(solution: Solution) -> None:
+    corners = solution.adjustment.problem.sensors
+    far = replace(corners[1], scale=40.0)
+    told = told_of(replace(solution, adjustment=with_sensors(solution, (corners[0], far))))
+    assert [each.kind for each in told if each.rank is Rank.DECISIVE] == ["noise"]
+    kept = corners[1].kept.copy()
+    kept[:4] = False
+    told = told_of(replace(solution, adjustment=with_sensors(solution, (corners[0], replace(corners[1], kept=kept)))))
+    assert [each.kind for each in told if each.rank is Rank.DECISIVE] == ["outliers"]
+    assert "scatter" in {each.kind for each in told_of(replace(solution, scatter=120.0)) if each.rank is Rank.DECISIVE}
+    assert "scatter" in {each.kind for each in told_of(replace(solution, scatter=2.0)) if each.rank is Rank.NOTE}
+
+
+def with_sensors(solution: Solution, sensors: tuple[Sensor, ...]) -> Adjustment:
+    return replace(solution.adjustment, problem=replace(solution.adjustment.problem, sensors=sensors))
 
 
 def test_a_step_moves_the_state_by_it(solution: Solution) -> None:

@@ -163,7 +163,7 @@ def test_what_varies_smoothly_over_the_image_is_solved_for_with_the_boards_place
     often = found.offsets.counts >= 3
     assert 0.2 < np.sqrt(np.mean((miss_m / stated_bias.sigma_image(TOF, true_m))[often] ** 2)) < 1.2
     assert np.std(miss_m[often]) < 0.5 * np.std(pattern_m[often])
-    assert not any(each.text.startswith("node") for each in warnings_of(solution, [], [], None, []))
+    assert not any(each.text.startswith("node") for each in warnings_of(solution, [], [], None, [], [], []))
 
 
 def test_sums_by_nodes_are_those_of_full_matrices() -> None:
