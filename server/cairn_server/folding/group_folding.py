@@ -80,8 +80,9 @@ class Waiting:
         for commit in commits:
             robot = commit.id.author.robot
             waits, is_trial = self.of_robot[robot], commit.number == self.trial
-            is_held = waits >= WAITING_OF_ROBOT_MAX or (waits > 0 and len(self.commits) >= WAITING_MAX)
-            if (is_held and not is_trial) or _touches(store, row, commit, self.cells):
+            is_many = waits >= WAITING_OF_ROBOT_MAX or (waits > 0 and len(self.commits) >= WAITING_MAX)
+            is_held = is_many and not is_trial
+            if is_held or _touches(store, row, commit, self.cells):
                 self._wait(commit)
                 if is_trial:  # and tells nothing of the object store: another one is to be tried
                     self.away.discard(commit.number)
