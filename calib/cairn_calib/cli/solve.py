@@ -28,9 +28,11 @@ cameras with Kannala and Brandt's model.
 
 With --range DIR the range camera's images of the same boards (16 bit, radial, --range-units-per-m) show the bias of
 its ranges, which rig.json states and mapping takes off: an offset, a scale, more at the image's corners, and each
-pixel's own part where pixels differ. With --amplitude DIR (16 bit, same names) also how that depends on the amplitude,
-with --modulation-mhz F its circular error: each only if amplitudes and ranges of the boards differ enough; else a
-warning says so.
+pixel's own part where pixels differ. Images of z-depth, as most depth cameras write them, need --z-depth; disparity of
+a rectified pair --disparity FOCAL_PX,BASELINE_M,N, with N counts a pixel (256 in KITTI's, 16 in OpenCV's); either must
+show, pixel by pixel, the image in which the corners were found. With --amplitude DIR (16 bit, same names) also how that
+depends on the amplitude, with --modulation-mhz F its circular error: each only if amplitudes and ranges of the boards
+differ enough; else a warning says so.
 
 What is known before counts with --prior: last year's rig.json, with the covariance that it states; a file of Kalibr,
 OpenCV, ROS or mrcal whose pixels are good to half a pixel (left=factory.yaml+-0.5); a number of a data sheet

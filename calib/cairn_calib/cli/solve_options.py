@@ -5,7 +5,7 @@ from pathlib import Path
 
 from cairn_calib.cli.known_lenses import add_known_options, with_known
 from cairn_calib.rig.rig import Spectrum
-from cairn_calib.solve.board_views import BoardViews, add_ranges, read_board_views
+from cairn_calib.solve.board_views import BoardViews, RangeCoding, add_ranges, read_board_views
 from cairn_calib.solve.solve_plan import PITCH_SIGMA, CameraPlan, SolvePlan, usual_plan
 from cairn_map.errors import BadInputError
 
@@ -38,6 +38,10 @@ def add_solve_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--range", type=Path, metavar="DIR", help="range images of the range camera, 16 bit")
     parser.add_argument("--range-units-per-m", type=float, default=1000.0, metavar="N", help="of those images (1000)")
+    parser.add_argument("--z-depth", action="store_true", help="those images are along the axis, not along the beam")
+    parser.add_argument(
+        "--disparity", metavar="FOCAL_PX,BASELINE_M,N", help="those images are disparity, N counts a pixel"
+    )
     parser.add_argument("--amplitude", type=Path, metavar="DIR", help="their amplitude images, 16 bit")
     parser.add_argument("--modulation-mhz", type=float, metavar="F", help="of its light, by the data sheet")
 
@@ -52,11 +56,34 @@ def read_by_options(args: argparse.Namespace) -> tuple[BoardViews, SolvePlan]:
     folders = dict(zip(plan.cameras, args.folders, strict=True))
     views = read_board_views(folders, frame=args.frame)
     plan = with_known(plan, args, views.sizes_px)
-    if args.range is None and (args.amplitude is not None or args.modulation_mhz is not None):
-        raise BadInputError("bad_arguments", "--amplitude and --modulation-mhz are of range images: add --range")
+    of_ranges = {
+        "--amplitude": args.amplitude,
+        "--modulation-mhz": args.modulation_mhz,
+        "--z-depth": args.z_depth or None,
+        "--disparity": args.disparity,
+    }
+    if args.range is None and (stray := [name for name, value in of_ranges.items() if value is not None]):
+        raise BadInputError("bad_arguments", f"{', '.join(stray)}: of range images; add --range")
     if args.range is not None:
-        views = add_ranges(views, plan, args.range, args.range_units_per_m, amplitudes=args.amplitude, frame=args.frame)
+        coding = _range_coding(args)
+        views = add_ranges(views, plan, args.range, coding, amplitudes=args.amplitude, frame=args.frame)
     return views, plan
+
+
+def _range_coding(args: argparse.Namespace) -> RangeCoding:
+    if args.disparity is None:
+        return RangeCoding(units=args.range_units_per_m, is_z_depth=args.z_depth)
+    try:
+        focal_px, baseline_m, units = (float(part) for part in args.disparity.split(","))
+    except ValueError as exc:
+        raise BadInputError(
+            "bad_arguments",
+            "--disparity is the focal length of the rectified images in pixels, the baseline in metres and the counts "
+            f"a pixel of disparity, such as 1050.2,0.12,256; got {args.disparity[:60]!r}",
+        ) from exc
+    if args.z_depth:
+        raise BadInputError("bad_arguments", "range images are z-depth or disparity: give --z-depth or --disparity")
+    return RangeCoding(units=units, disparity=(focal_px, baseline_m))
 
 
 def _plan(args: argparse.Namespace) -> SolvePlan:

@@ -41,13 +41,17 @@ class BoardView:
 
 @dataclass(frozen=True, slots=True)
 class RangeView:
-    """The range image of one frame: (H, W) metres along the beam, NaN where nothing came back."""
+    """The range image of one frame: (H, W) metres along the beam or, of z-depth, along the optical axis.
+
+    NaN where nothing came back.
+    """
 
     camera: str
     frame: str
     range_m: npt.NDArray[np.floating]
     amplitude: npt.NDArray[np.integer] | None = None
     """(H, W) counts of the light that came back; 0: unknown, 65535: too much."""
+    is_z_depth: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,11 +204,41 @@ def _input_file(camera: str, path: Path) -> InputFile:
     return InputFile(name=f"{camera}/{path.name}"[:200], size_bytes=len(data), sha256=hashlib.sha256(data).hexdigest())
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RangeCoding:
+    """Meaning of the counts of a range image; 0 is no return.
+
+    range or z-depth: counts / units metres; disparity: z-depth = focal_px baseline_m / (counts / units).
+    """
+
+    units: float = 1000.0
+    """Counts a metre; of disparity, counts a pixel."""
+    is_z_depth: bool = False
+    """True if metres are along the optical axis, not along the beam."""
+    disparity: tuple[float, float] | None = None
+    """Focal length of the rectified images, pixels, and baseline, metres; None: no disparity."""
+
+    def __post_init__(self) -> None:
+        numbers = (self.units, *(self.disparity or ()))
+        if not all(np.isfinite(each) and each > 0 for each in numbers):
+            raise BadInputError("bad_arguments", f"units, focal length and baseline are above 0, got {numbers}")
+
+    @property
+    def is_along_axis(self) -> bool:
+        """True if what the counts give is z-depth."""
+        return self.is_z_depth or self.disparity is not None
+
+    def metres(self, counts: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
+        """(H, W) metres of (H, W) counts; NaN for 0."""
+        known = np.where(counts > 0, counts, np.nan).astype(np.float64) / self.units
+        return known if self.disparity is None else self.disparity[0] * self.disparity[1] / known
+
+
 def add_ranges(
     views: BoardViews,
     plan: SolvePlan,
     folder: Path,
-    units_per_m: float,
+    coding: RangeCoding,
     *,
     amplitudes: Path | None = None,
     frame: str | None = None,
@@ -216,8 +250,8 @@ def add_ranges(
     Args:
         views: views of the boards.
         plan: names the range camera.
-        folder: range images, radial; 0 where nothing came back. They belong to frames as corner images do.
-        units_per_m: counts of a range image per metre.
+        folder: range images, pixel by pixel those of the camera's corners. They belong to frames as corner images do.
+        coding: meaning of their counts.
         amplitudes: a folder of images of the same frames; None: the amplitudes are unknown.
         frame: the pattern of `frames_of`.
 
@@ -226,15 +260,17 @@ def add_ranges(
     """
     # Ranges belong to the first range camera of the plan.
     owner = next((name for name, camera in plan.cameras.items() if camera.spectrum is Spectrum.RANGE), None)
-    if owner is None or not units_per_m > 0:
-        raise BadInputError("bad_arguments", "--range needs a camera of spectrum range, and units per metre above 0")
+    if owner is None:
+        raise BadInputError("bad_arguments", "--range needs a camera of spectrum range")
+    if coding.is_along_axis and plan.cameras[owner].model != "pinhole":
+        raise BadInputError("bad_arguments", f"{owner} is a fisheye, which has no z-depth: its images hold range")
     bright = {} if amplitudes is None else _by_frame(amplitudes, "amplitude", frame)
     inputs: list[InputFile] = []
     ranges = []
     for name, path in _by_frame(folder, "range", frame).items():
         counts = _read(path, "range", inputs)
         amplitude = _read(bright[name], "amplitude", inputs).astype(np.uint16) if name in bright else None
-        ranges.append(RangeView(owner, name, np.where(counts > 0, counts / units_per_m, np.nan), amplitude))
+        ranges.append(RangeView(owner, name, coding.metres(counts), amplitude, coding.is_along_axis))
     return replace(views, ranges=tuple(ranges), inputs=(*views.inputs, *inputs))
 
 

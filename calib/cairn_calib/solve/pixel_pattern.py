@@ -78,8 +78,8 @@ def pixel_pattern(views: BoardViews, done: Adjustment, covariance: Floats) -> Pi
     if every is None:
         return None
     every = every.with_terms(used.terms, lens)
-    true_m = plane_ranges(every, state, board)
-    left_m = every.range_m - true_m - every.added_m(lens, true_m, state.bias)
+    true_m, measured_m = plane_ranges(every, state, board)
+    left_m = measured_m - true_m - every.added_m(lens, true_m, state.bias)
     # The pixels' own part, then the nodes'.
     sound = _sound(every, left_m, lens.width, STRAY_SIGMAS * sensor.scale * used.sigma_m)
     found = _pattern_of(sound, (lens.height, lens.width))

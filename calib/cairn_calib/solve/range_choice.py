@@ -57,9 +57,9 @@ def range_spans(data: RangeData, state: RigState, board: Board) -> RangeSpans:
         BadInputError: the ranges are in other units than the board.
     """
     seen = data.measured
-    true_m = plane_ranges(data, state, board)[seen]
+    true_m, measured_m = (each[seen] for each in plane_ranges(data, state, board))
     # Ranges in other units would be met by an absurd scale.
-    times = float(np.median(data.range_m[seen] / true_m))
+    times = float(np.median(measured_m / true_m))
     if not 1 / TIMES_MAX < times < TIMES_MAX:
         raise BadInputError(
             "range_units",

@@ -3,7 +3,10 @@
     true range = (n . (o - c) + w) / (n . v)      n, o: the board's normal and origin, w: its warp there; v: the pixel's
     residual   = (true + bias - measured) / s     ray, c: the camera; all in the rig's frame, metres
 
-Every pixel that looks at the inside of the board measures its plane, whatever is printed on it.
+Every pixel that looks at the inside of the board measures its plane, whatever is printed on it. Of an image of
+z-depth z the residual is ((true + bias) v_z - z) / (s u_z): v_z is the ray's third component in the camera's frame,
+u_z the same by the lens of the start, which is kept. With z / v_z as the measured range instead, noise would stand on
+the side of the lens, and pull its focal length (by a quarter of its sigma in a simulation).
 """
 
 from collections.abc import Sequence
@@ -43,8 +46,8 @@ class RangeData:
     """(V,)"""
     pixels: Floats
     """(V, M, 2)"""
-    range_m: Floats
-    """(V, M)"""
+    given_m: Floats
+    """(V, M) measured ranges along the beam; of z-depth by the lens of the start."""
     measured: Flags
     """(V, M)"""
     sigma_m: float
@@ -55,6 +58,16 @@ class RangeData:
     """Shapes of the bias."""
     nodes: PixelNodes | None = None
     """Nodes around each pixel; None where `terms` has no nodes."""
+    along_axis: Floats | None = None
+    """(V, M) of z-depth: third component of the pixels' rays by the lens of the start; None: ranges along the beam."""
+
+    def range_m(self, rays_camera: Floats) -> Floats:
+        """(V, M) measured ranges along the beam, for the pixels' (V, M, 3) unit rays."""
+        return self.given_m / self.along(rays_camera)
+
+    def along(self, rays_camera: Floats) -> Floats:
+        """(V, M) v_z / u_z of z-depth; 1 of ranges along the beam."""
+        return np.ones_like(self.given_m) if self.along_axis is None else rays_camera[..., 2] / self.along_axis
 
     def shapes(self, raster: Raster, range_m: Floats) -> Floats:
         """(V, M, D) metres that one unit of each of `terms`, except nodes, adds to (V, M) true ranges."""
@@ -114,12 +127,17 @@ def range_data(
         pixels_px[n, : len(pixels)], range_m[n, : len(pixels)] = pixels, ranges
         amplitude[n, : len(pixels)], measured[n, : len(pixels)] = amplitudes, True
     indices = np.array([frame for frame, _, _, _ in chosen], np.intp)
-    return RangeData(camera, indices, pixels_px, range_m, measured, sigma_m, amplitude)
+    data = RangeData(camera, indices, pixels_px, range_m, measured, sigma_m, amplitude)
+    if not any(view.is_z_depth for view in views):
+        return data
+    along_axis = lens.unproject(pixels_px)[..., 2]
+    return replace(data, given_m=range_m / along_axis, along_axis=along_axis)
 
 
-def plane_ranges(data: RangeData, state: RigState, board: Board) -> Floats:
-    """(V, M) ranges at which the pixels' rays meet the board, metres."""
-    return _intersect_board(data, state, board, state.lenses[data.camera].unproject(data.pixels)).range_m
+def plane_ranges(data: RangeData, state: RigState, board: Board) -> tuple[Floats, Floats]:
+    """(V, M) ranges at which the pixels' rays meet the board, and those that were measured, metres."""
+    rays = state.lenses[data.camera].unproject(data.pixels)
+    return _intersect_board(data, state, board, rays).range_m, data.range_m(rays)
 
 
 def range_block(data: RangeData, state: RigState, layout: ParameterLayout, board: Board, loss: Loss) -> Block:
@@ -147,12 +165,18 @@ def range_block(data: RangeData, state: RigState, layout: ParameterLayout, board
     columns += [np.cross(n, hits.off_board) / slant[..., None], n / slant[..., None]]
     # The measured range moves by `slope` with the true one. Columns of the bias stand before the board's two.
     slope = data.slope(hits.range_m, state.bias)
-    columns = [slope[..., None] * column for column in columns]
-    columns.insert(-2, shapes)
+    along = data.along(seen.rays)
+    columns = [(slope * along)[..., None] * column for column in columns]
+    predicted_m = d + data.added_m(state.lenses[c], d, state.bias)
+    if data.along_axis is not None:
+        # v_z moves with the lens.
+        by_v_z = predicted_m / data.along_axis
+        columns[0] = columns[0] + by_v_z[..., None] * seen.by_intrinsics[..., 2, layout.intrinsic_columns[c]]
+    columns.insert(-2, along[..., None] * shapes)
     at.append(layout.bias_at[: shapes.shape[-1]])
     # Whiten, weigh by the loss, and sum.
     noise_m = loss.scale * data.sigma_m
-    missed = d + data.added_m(state.lenses[c], d, state.bias) - data.range_m
+    missed = along * predicted_m - data.given_m
     residuals = np.where(data.measured, missed / noise_m, 0.0)
     weights, cost = loss(residuals**2)
     root = np.sqrt(weights)
@@ -163,7 +187,7 @@ def range_block(data: RangeData, state: RigState, layout: ParameterLayout, board
     block = Block(np.concatenate(at), data.frames, J_t @ J, pull, residuals[..., None], cost)
     if data.nodes is None:
         return block
-    root_a_metre = root * data.measured / noise_m
+    root_a_metre = along * root * data.measured / noise_m
     return _with_nodes(block, data.nodes, J, root_a_metre, root * residuals, layout.bias_at[shapes.shape[-1] :])
 
 
