@@ -11,25 +11,44 @@ dark**. A thermal camera may see dark cells bright; that is the pair's polarity,
 """
 
 import re
+from collections.abc import Mapping
 from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from cairn_map.arrays import Floats
-from cairn_map.errors import BadInputError
+from cairn_map.errors import BadInputError, first_error
 
-Pattern = Literal["chessboard", "circles", "asymmetric-circles"]
+Pattern = Literal["chessboard", "circles", "asymmetric-circles", "points"]
 Polarity = Literal["normal", "reversed"]
 """normal: the camera sees printed dark as dark; reversed: as bright."""
-Side = Annotated[int, Field(ge=3, le=64)]
+Side = Annotated[int, Field(ge=1, le=64)]
+SIDE_MIN = 3
+"""Columns and rows of a grid, at least."""
+NAMED_MIN = 6
+"""Named points of a board, at least; with fewer its pose is hardly more than noise."""
+FLAT_SHARE = 0.05
+"""Spread of named points across their longest line, as a share of it, at least."""
+Place = Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)]
 Length = Annotated[float, Field(gt=0, le=100, allow_inf_nan=False)]
+
+
+class NamedPoint(BaseModel):
+    """A point of a board with a name of its own: a pin, a lamp, a heated dot."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: Annotated[str, Field(min_length=1, max_length=64)]
+    place_m: tuple[Place, Place]
+    """x and y in the board's frame, metres."""
 
 
 class Board(BaseModel):
     """One flat target: `columns` x `rows` points, `pitch_m` from one to the next.
 
-    Of asymmetric circles, every second row is moved by half a step: rows are `pitch_m` apart, columns twice that.
+    Of asymmetric circles, every second row is moved by half a step: rows are `pitch_m` apart, columns twice that. Named
+    points are one row, in their order, at places of their own; `pitch_m` is the smallest distance of two of them.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -40,14 +59,31 @@ class Board(BaseModel):
     pitch_m: Length
     disc_m: Length | None = None
     """Diameter of its discs. None: a chessboard, or unknown; then centroids are taken for the images of centres."""
+    named: Annotated[tuple[NamedPoint, ...], Field(max_length=64)] | None = None
+    """Points of the pattern `points`, which lie in a rectangle from (0, 0); None for grids."""
 
     @model_validator(mode="after")
     def _check_disc(self) -> Self:
         if self.disc_m is None:
             return self
         apart = self.pitch_m * (2**0.5 if self.pattern == "asymmetric-circles" else 1.0)
-        if self.pattern == "chessboard" or self.disc_m >= apart:
+        if self.pattern in ("chessboard", "points") or self.disc_m >= apart:
             raise ValueError(f"disc_m is the diameter of discs that are {apart:g} m apart, got {self.disc_m:g} m")
+        return self
+
+    @model_validator(mode="after")
+    def _check_size(self) -> Self:
+        if (self.pattern == "points") != (self.named is not None):
+            raise ValueError("named are the points of the pattern points, and of no other")
+        if self.named is None:
+            if min(self.columns, self.rows) < SIDE_MIN:
+                raise ValueError(f"a grid has {SIDE_MIN} columns and rows at least, got {self.columns} x {self.rows}")
+            return self
+        names = [each.name for each in self.named]
+        if len(set(names)) < len(names) or len(names) < NAMED_MIN:
+            raise ValueError(f"a board has {NAMED_MIN} named points at least, each once, got {', '.join(names)[:80]}")
+        if (self.columns, self.rows) != (len(names), 1):
+            raise ValueError(f"{len(names)} named points are 1 row of {len(names)} columns")
         return self
 
     @property
@@ -58,12 +94,16 @@ class Board(BaseModel):
     @property
     def has_turn_symmetry(self) -> bool:
         """True if the board looks the same after a half or a quarter turn, so that no image shows its first point."""
+        if self.pattern == "points":
+            return False
         if self.pattern == "asymmetric-circles":
             return self.rows % 2 == 0
         return self.pattern == "circles" or (self.columns + self.rows) % 2 == 0
 
     def lattice(self) -> Floats:
         """(N, 2) place of each point in units of the pitch, in order."""
+        if self.named is not None:
+            return np.array([each.place_m for each in self.named]) / self.pitch_m
         column, row = np.meshgrid(np.arange(self.columns, dtype=np.float64), np.arange(self.rows, dtype=np.float64))
         if self.pattern == "asymmetric-circles":
             column = 2 * column + row % 2
@@ -86,3 +126,25 @@ def board_size(text: str) -> tuple[int, int]:
             "bad_board", f"a board is COLUMNSxROWS of inner corners, such as 9x6, 3 to 64 each, got {text!r}"
         )
     return int(found[1]), int(found[2])
+
+
+def named_board(places_m: Mapping[str, tuple[float, float]]) -> Board:
+    """The board of points by name, at places in any frame of the board's plane (x right, y down, metres).
+
+    Raises:
+        BadInputError: fewer than 6, more than 64, two at one place, or all in a line.
+    """
+    xy = np.array([*places_m.values()], np.float64).reshape(-1, 2)
+    if len(xy) < NAMED_MIN or not np.isfinite(xy).all():
+        raise BadInputError("bad_board", f"a board has {NAMED_MIN} named points at least, got {len(xy)}")
+    xy = xy - xy.min(axis=0)
+    apart = np.linalg.norm(xy[:, None] - xy, axis=-1)[~np.eye(len(xy), dtype=bool)]
+    if apart.min() <= 0 or np.linalg.svd(xy - xy.mean(axis=0), compute_uv=False)[1] < FLAT_SHARE * apart.max():
+        raise BadInputError("bad_board", "points of a board are at places of their own, and not all in one line")
+    try:
+        named = tuple(
+            NamedPoint(name=name, place_m=(float(x), float(y))) for name, (x, y) in zip(places_m, xy, strict=True)
+        )
+        return Board(pattern="points", columns=len(named), rows=1, pitch_m=float(apart.min()), named=named)
+    except ValidationError as exc:
+        raise BadInputError("bad_board", first_error(exc)) from exc

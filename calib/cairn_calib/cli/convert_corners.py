@@ -17,6 +17,13 @@ of the folders before it.
     .mat            imagePoints, boardSize; save -v7        the same for all           imageFileNames
     .csv            image,column,row,x,y[,sigma]            sigma, pixels              yes
 
+Points with names of their own, at any places of a flat board (pins, lamps, heated dots; bright or dark): a table of
+their places for --points, and one of where each is in the images; no --board, no --square. --blobs moves a point that
+was clicked by hand to the middle of the bright or dark blob that it is on, and states how certain that is.
+
+    $ cairn calib convert-corners seen.csv corners/thermal --points pins.csv --blobs 8
+    pins.csv: point,x_m,y_m                seen.csv: image,point,x,y[,sigma]
+
 Points are in the board's order, row by row (MATLAB's, which go column by column, are turned). `--square` is the edge
 of a cell in metres; `--board` is needed where the file does not say it, for .vnl. How large the images are is taken
 from the file, or from the images themselves, if they are where the file says, or next to it; else say `--size`.
@@ -31,14 +38,18 @@ import hashlib
 import re
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cairn_calib.board.board import board_size
+import numpy as np
+
+from cairn_calib.board.board import Board, board_size, named_board
 from cairn_calib.board.corner_file import CornerFile, read_corner_file
 from cairn_calib.board.corner_pictures import overlay, write_picture
+from cairn_calib.corner_search.blob_middle import REACH_MAX_PX, blob_middle
 from cairn_calib.exchange.corner_list import KIND, CornerList, board_of, documents
-from cairn_calib.exchange.corner_table import read_table, write_table
+from cairn_calib.exchange.corner_table import read_named_places, read_named_table, read_table, write_table
 from cairn_calib.exchange.matlab_corners import read_matlab_points
 from cairn_calib.exchange.mrcal_corners import read_vnl, write_vnl
 from cairn_calib.exchange.opencv_corners import read_opencv_points
@@ -70,6 +81,10 @@ def add_parser(commands: "_SubParsersAction[argparse.ArgumentParser]") -> None:
     )
     added.add_argument("--disc", type=float, metavar="METRES", help="diameter of a disc, for grids of discs")
     added.add_argument("--size", metavar="WIDTHxHEIGHT", help="of the images, where neither IN nor they say it")
+    added.add_argument("--points", type=Path, metavar="CSV", help="named points of the board: point,x_m,y_m")
+    added.add_argument(
+        "--blobs", type=float, metavar="PX", help="points are clicks, at most this far from blobs' middles"
+    )
     added.add_argument("--images", metavar="PATTERN", help="only these, such as '*-cam0.jpg': one camera of several")
     added.set_defaults(run=run)
 
@@ -88,14 +103,10 @@ def run(args: argparse.Namespace) -> None:
 
 def _import(args: argparse.Namespace) -> None:
     path: Path = args.files[0]
-    if args.square is None or not 0 < args.square <= 100:
-        raise BadInputError("bad_board", f"--square is an edge in metres, above 0 and at most 100, got {args.square}")
-    size = None if args.board is None else board_size(args.board)
-    listed = _read(path, size)
-    if args.images is not None:
-        listed = listed.matching(args.images)
-    board = board_of(listed, size=size, pitch_m=args.square, pattern=args.pattern, disc_m=args.disc)
+    listed, board = _listed_and_board(path, args)
     places = [_image_path(each.name, path) for each in listed.images]
+    if args.blobs is not None:
+        listed = _with_blobs(listed, places, args.blobs)
     stated = None if args.size is None else (None, _size(args.size))
     # Read one after another: all pictures of a session do not fit into memory.
     files = [stated if place is None else _digest_and_size(place) for place in places]
@@ -118,14 +129,55 @@ def _import(args: argparse.Namespace) -> None:
         )
 
 
-def _read(path: Path, size: tuple[int, int] | None) -> CornerList:
-    data = read_bounded(path, FILE_BYTES_MAX)
-    if path.suffix == ".mat":
-        return read_matlab_points(data, stem=path.stem, name=path.name)
+def _listed_and_board(path: Path, args: argparse.Namespace) -> tuple[CornerList, Board]:
+    """The images of a file, as far as they are wanted, and their board."""
+    if args.points is not None:
+        if path.suffix != ".csv" or args.board is not None or args.square is not None:
+            raise BadInputError("bad_arguments", "--points is of a table (.csv), without --board and --square")
+        board = named_board(read_named_places(_text(args.points), name=args.points.name))
+        listed = read_named_table(_text(path), board=board, name=path.name)
+        return (listed if args.images is None else listed.matching(args.images)), board
+    if args.square is None or not 0 < args.square <= 100:
+        raise BadInputError("bad_board", f"--square is an edge in metres, above 0 and at most 100, got {args.square}")
+    size = None if args.board is None else board_size(args.board)
+    listed = _read(path, size)
+    listed = listed if args.images is None else listed.matching(args.images)
+    return listed, board_of(listed, size=size, pitch_m=args.square, pattern=args.pattern, disc_m=args.disc)
+
+
+def _with_blobs(listed: CornerList, places: Sequence[Path | None], reach_px: float) -> CornerList:
+    """The list with each point moved to the middle of its blob; points without one are hidden, and named."""
+    if not 1 <= reach_px <= REACH_MAX_PX:
+        raise BadInputError("bad_arguments", f"--blobs is 1 to {REACH_MAX_PX:g} pixels, got {reach_px:g}")
+    images = []
+    for image, place in zip(listed.images, places, strict=True):
+        if place is None:
+            raise BadInputError(KIND, f"--blobs looks into the images, and {image.name} is not there")
+        counts, _ = read_grey(place)
+        pixels, covariance_px2 = image.pixels.copy(), image.covariance_px2.copy()
+        for n in np.flatnonzero(np.isfinite(pixels[:, 0])):
+            found = blob_middle(counts, pixels[n], reach_px)
+            if isinstance(found, str):
+                x, y = pixels[n]
+                sys.stderr.write(f"{image.name}: the point at ({x:.0f}, {y:.0f}) is left out: {found}\n")
+                pixels[n], covariance_px2[n] = np.nan, np.nan
+            else:
+                pixels[n], covariance_px2[n] = found.pixel, found.covariance_px2
+        images.append(replace(image, pixels=pixels, covariance_px2=covariance_px2))
+    return replace(listed, images=tuple(images))
+
+
+def _text(path: Path) -> str:
     try:
-        text = data.decode("utf-8-sig")
+        return read_bounded(path, FILE_BYTES_MAX).decode("utf-8-sig")
     except UnicodeDecodeError as exc:
         raise BadInputError(KIND, f"{path} is no text: {exc.reason} at byte {exc.start}") from exc
+
+
+def _read(path: Path, size: tuple[int, int] | None) -> CornerList:
+    if path.suffix == ".mat":
+        return read_matlab_points(read_bounded(path, FILE_BYTES_MAX), stem=path.stem, name=path.name)
+    text = _text(path)
     if path.suffix == ".vnl":
         return read_vnl(text, name=path.name)
     if path.suffix == ".csv":

@@ -112,7 +112,7 @@ def corners_of(image: ListedImage, board: Board, *, source: str) -> Detection:
     hidden = ~np.isfinite(pixels[:, 0] + pixels[:, 1])
     pixels[hidden], covariance_px2[hidden] = np.nan, np.nan
     corners = Corners(board, pixels, covariance_px2)
-    if turn_share(corners) < 0.5:
+    if is_mirrored(corners):
         raise BadInputError(
             KIND,
             f"{image.name}: its points run mirrored: going along a row, the next row must be to the right hand, as "
@@ -122,16 +122,14 @@ def corners_of(image: ListedImage, board: Board, *, source: str) -> Detection:
     return Detection(corners, (Attempt("import", 1.0, "found", f"from {source}"),))
 
 
-def turn_share(corners: Corners) -> float:
-    """Share of a board's triangles (a point, its right and its lower neighbour) that run clockwise in the image.
+def is_mirrored(corners: Corners) -> bool:
+    """True if the points run counter-clockwise in the image: no board that is seen from the front does.
 
-    1 for a board that is seen from the front; 1 where no triangle is seen.
+    By the affine map that fits them best; False for points in a line.
     """
-    grid = corners.pixels.reshape(corners.board.rows, corners.board.columns, 2)
-    along, down = grid[:-1, 1:] - grid[:-1, :-1], grid[1:, :-1] - grid[:-1, :-1]
-    cross = along[..., 0] * down[..., 1] - along[..., 1] * down[..., 0]
-    seen = np.isfinite(cross)
-    return float((cross[seen] > 0).mean()) if seen.any() else 1.0
+    places = np.column_stack([corners.board.lattice(), np.ones(corners.board.count)])[corners.seen]
+    fitted, *_ = np.linalg.lstsq(places, corners.pixels[corners.seen], rcond=None)
+    return float(np.linalg.det(fitted[:2])) < 0
 
 
 def documents(

@@ -80,7 +80,9 @@ def _head(seen: Examination) -> dict[str, object] | None:
     return {
         "made": time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(calibration.made_s)),
         "software": calibration.software,
-        "board": f"{board.columns} x {board.rows} {board.pattern}, pitch {1000 * board.pitch_m:g} mm",
+        "board": f"{board.count} named points"
+        if board.named is not None
+        else f"{board.columns} x {board.rows} {board.pattern}, pitch {1000 * board.pitch_m:g} mm",
         "gauge": calibration.gauge,
         "cards": cards,
         "statistics": statistics_table(fit),

@@ -39,8 +39,10 @@ class BoardLine:
 def board_lines(corners: Corners, places: Floats) -> list[BoardLine]:
     """Lines through rows and columns of a board, by total least squares, of (N, 2) places of its points (NaN: hidden).
 
-    Of asymmetric circles, rows alone, and every second column's points.
+    Of asymmetric circles, rows alone, and every second column's points; of named points, none.
     """
+    if corners.board.named is not None:
+        return []
     grid = places.reshape(corners.board.rows, corners.board.columns, 2)
     along = [grid[row] for row in range(len(grid))]
     if corners.board.pattern == "asymmetric-circles":
