@@ -14,8 +14,8 @@ Picture = npt.NDArray[np.uint8]
 
 LONGEST_PX = 1000
 """Longest side of a picture, at least, pixels: small images are enlarged so that single corners can be seen."""
-SIGMAS = 150.0
-"""Ellipses are drawn this many standard deviations large: corners are good to hundredths of a pixel."""
+MARK_PX, FIRST_PX = 13, 30
+"""Sides of a corner's cross, and of the square about the first one, pixels of the picture."""
 STRETCH = (0.5, 99.8)
 """Percentiles of the counts that become black and white."""
 BAND_PX = 28
@@ -29,7 +29,8 @@ FIRST, LAST, TEXT = (60, 60, 255), (255, 160, 40), (80, 255, 80)
 def overlay(counts: Grey, corners: Corners | None, *, title: str) -> Picture:
     """(H, W, 3) uint8, OpenCV's B, G, R: the image with its corners, rows joined in order from red to blue.
 
-    The first corner is ringed twice. Ellipses are 150 standard deviations large; gaps are hidden corners.
+    A cross marks each corner, a square the first one; gaps are hidden corners. No mark is round: a circle on a disc
+    would look like its outline, badly fitted.
     """
     low, high = np.percentile(counts, STRETCH)
     grey = np.clip((counts - low) / max(float(high - low), 1e-9) * 255, 0, 255).astype(np.uint8)
@@ -74,13 +75,9 @@ def _draw(picture: Picture, corners: Corners, scale: int) -> None:
         if previous is not None:
             cv2.line(picture, previous, centre, colour, 1, cv2.LINE_AA)
         previous = centre
-        values, vectors = np.linalg.eigh(corners.covariance_px2[index])
-        axes = tuple(max(3, round(SIGMAS * scale * float(np.sqrt(max(value, 0.0))))) for value in values)
-        turn = float(np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0])))
-        cv2.ellipse(picture, centre, (min(axes[0], 60), min(axes[1], 60)), turn, 0, 360, colour, 1, cv2.LINE_AA)
+        cv2.drawMarker(picture, centre, colour, cv2.MARKER_CROSS, MARK_PX, 1, cv2.LINE_AA)
         if index == 0:
-            cv2.circle(picture, centre, 12, FIRST, 2, cv2.LINE_AA)
-            cv2.circle(picture, centre, 16, FIRST, 1, cv2.LINE_AA)
+            cv2.drawMarker(picture, centre, FIRST, cv2.MARKER_SQUARE, FIRST_PX, 2, cv2.LINE_AA)
 
 
 def resampled(path: Path, size_px: tuple[int, int], at: Floats) -> bytes | None:

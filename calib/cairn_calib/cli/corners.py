@@ -214,12 +214,29 @@ def _board(args: argparse.Namespace) -> Board:
     columns, rows = board_size(args.board)
     if not 0 < args.square <= 100:
         raise BadInputError("bad_board", f"--square is an edge in metres, above 0 and at most 100, got {args.square}")
-    if (args.pattern == "chessboard") != (args.disc is None):
-        raise BadInputError("bad_board", "--disc is the diameter in metres of a grid's discs: give it for them alone")
+    if args.pattern != "chessboard" and args.disc is None:
+        raise BadInputError(
+            "bad_board", f"a board of {args.pattern} needs --disc, the diameter of its discs in metres: --disc 0.03"
+        )
+    if args.pattern == "chessboard" and args.disc is not None:
+        raise BadInputError(
+            "bad_board", "--disc is of discs, and a chessboard has none: leave it out, or say --pattern circles"
+        )
     try:
-        return Board(pattern=args.pattern, columns=columns, rows=rows, pitch_m=args.square, disc_m=args.disc)
+        board = Board(pattern=args.pattern, columns=columns, rows=rows, pitch_m=args.square, disc_m=args.disc)
     except ValidationError as exc:
         raise BadInputError("bad_board", f"--disc: {first_error(exc)}") from exc
+    if board.has_turn_symmetry and not args.upright and args.outer_corners is None:
+        better = (
+            "one with an odd and an even side" if args.pattern == "chessboard" else "asymmetric circles in odd rows"
+        )
+        raise BadInputError(
+            "board_turns",
+            f"a board of {args.board} {args.pattern} looks the same after half a turn, so that no image shows which of "
+            "its points is the first: add --upright if its rows always run along the images' rows, left to right (for "
+            f"a rig of one camera any point may be the first: add it, too), or use another board: {better}",
+        )
+    return board
 
 
 def _polarity(results: Sequence[SearchedImage], args: argparse.Namespace) -> Polarity:

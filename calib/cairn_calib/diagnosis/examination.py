@@ -17,6 +17,7 @@ from cairn_calib.diagnosis.view_statistics import Coverage, coverage
 from cairn_calib.diagnosis.weak_modes import WeakMode, weak_modes
 from cairn_calib.rig.rig import Rig
 from cairn_calib.solve.solution import Solution
+from cairn_map.errors import BadInputError
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,9 +44,15 @@ def examine(solution: Solution, rig: Rig) -> Examination:
     """The examination of a solution and its rig.
 
     Raises:
-        BadInputError: a focal length is not determined, or everything hangs on one frame.
+        BadInputError: a lens is not determined, or everything hangs on one frame.
     """
     probes = probes_of(rig, solution.plan.gauge, solution.layout)
+    if not probes:
+        raise BadInputError(
+            "not_usable",
+            f"the lens of {solution.plan.gauge} came out as one that sees nothing: a lens of another kind (--fisheye), "
+            "corners of another board, or too few images",
+        )
     covered = [coverage(solution, name) for name in solution.plan.cameras]
     moved = influences(solution, probes)
     refuse_undetermined(solution, moved)

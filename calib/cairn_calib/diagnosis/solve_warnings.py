@@ -71,6 +71,9 @@ def refuse_undetermined(solution: Solution, influences: Sequence[Influence]) -> 
         free = [axis for axis in ("fx", "fy") if (name, axis) in sigmas]
         share = max((sigmas[name, axis] / abs(values[name, axis]) for axis in free), default=0.0)
         if not share < FOCAL_SHARE_MAX:
+            # Contradictions enlarge all standard deviations: then they are the cause.
+            if wrong := [each for each in (*_of_noise(solution), *_of_scatter(solution)) if each.rank is Rank.DECISIVE]:
+                raise BadInputError("not_usable", str(wrong[0]))
             raise BadInputError(
                 "not_observable",
                 f"the images leave the focal length of {name} open (its standard deviation is {share:.0%} of it, "
@@ -205,8 +208,9 @@ def _of_noise(solution: Solution) -> Iterator[SolveWarning]:
         most = max(NOISE_MAX_PX, NOISE_MAX_WIDTH * width)
         if noise_px > most:
             text = (
-                "corners miss by so much that they cannot be what they were taken for: another board (--board, "
-                "--square, --disc), a lens of another kind (--fisheye), or images of several cameras or zooms"
+                "corners miss by so much that they cannot be what they were taken for: images not of one moment (look "
+                "at the pairing), another board (--board, --square, --disc), a lens of another kind (--fisheye), or "
+                "several zooms"
             )
             yield SolveWarning("noise", name, noise_px, most, "px", text, Rank.DECISIVE)
         else:

@@ -80,7 +80,7 @@ def _overlay(image: ReportImage) -> str:
         x, y = places[0][2:]
         parts.append(
             f'<polyline points="{path}" fill="none" stroke="#ff5a1f" stroke-width="{line:.2f}"/>'
-            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{4 * line:.1f}" fill="none" stroke="#19c37d" '
-            f'stroke-width="{1.5 * line:.2f}"/>'
+            f'<rect x="{x - 4 * line:.1f}" y="{y - 4 * line:.1f}" width="{8 * line:.1f}" height="{8 * line:.1f}" '
+            f'fill="none" stroke="#19c37d" stroke-width="{1.5 * line:.2f}"/>'
         )
     return "".join([*parts, "</svg>"])

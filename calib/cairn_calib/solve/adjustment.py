@@ -34,6 +34,8 @@ COARSE = 1e-2
 """Expected fall of the cost that ends a descent while outliers and noise are still open: a tenth of a sigma."""
 SCALE_SETTLED = 1e-3
 """Relative change of a sensor's noise below which its estimate has settled."""
+NOISE_MIN_PX, NOISE_MIN_M = 1e-4, 1e-6
+"""Noise of corners and ranges, pixels and metres, at least: a hundredth of what the best detectors reach."""
 MEDIAN_SQUARE = {1: 0.4549, 2: 1.3863}
 """Median of chi2 with 1 and 2 degrees of freedom."""
 
@@ -61,6 +63,13 @@ class Sensor:
         return self.scale * float(np.sqrt(self.scatter))
 
     @property
+    def scale_min(self) -> float:
+        """Least noise over the stated one: exact points leave rounding, by which nothing can be weighed."""
+        return (
+            NOISE_MIN_PX / self.data.sigma_px if isinstance(self.data, CornerData) else NOISE_MIN_M / self.data.sigma_m
+        )
+
+    @property
     def axes(self) -> int:
         """Number of residuals of one point."""
         return 2 if isinstance(self.data, CornerData) else 1
@@ -82,6 +91,7 @@ class AdjustmentProblem:
         board = (self.board.points(), warp_shape(self.board))
         blocks = []
         for sensor in self.sensors:
+            # Noise and the scatter of frames weigh alike.
             loss = Loss(sensor.whole_scale, sensor.kept, huber_sigmas)
             if isinstance(sensor.data, CornerData):
                 blocks.append(corner_block(sensor.data, state, self.layout, board, loss))
@@ -227,9 +237,9 @@ def _rescale(result: Adjustment) -> tuple[Sensor, ...]:
     free = redundancies(result.blocks, uncertainty(result.normal), sensors)
     scaled = []
     for sensor, block, count in zip(sensors, result.blocks, free, strict=True):
-        # Residuals are whitened by the old scale, so the new one is its multiple.
+        # Residuals are whitened by the old scale, so the new one is its multiple. Scatter of frames is not known yet.
         variance = float(np.sum(block.residuals[sensor.kept] ** 2)) / count if count > 1 else 1.0
-        scaled.append(replace(sensor, scale=sensor.scale * np.sqrt(variance) if variance > 0 else sensor.scale))
+        scaled.append(replace(sensor, scale=max(sensor.scale * float(np.sqrt(variance)), sensor.scale_min)))
     return tuple(scaled)
 
 
@@ -238,7 +248,7 @@ def _rescale_by_median(problem: AdjustmentProblem, state: RigState) -> Adjustmen
     scaled = []
     for sensor, block in zip(problem.sensors, problem.blocks(state), strict=True):
         squares = np.sum(block.residuals**2, axis=-1)[sensor.kept]
-        # Squares of residuals of one sigma have the median of chi2.
+        # Squares of residuals of one sigma have the median of chi2; those of exact points are 0.
         factor = np.sqrt(np.median(squares) / MEDIAN_SQUARE[sensor.axes]) if squares.size else 1.0
-        scaled.append(replace(sensor, scale=sensor.scale * float(factor or 1.0)))
+        scaled.append(replace(sensor, scale=max(sensor.scale * float(factor), sensor.scale_min)))
     return replace(problem, sensors=tuple(scaled))

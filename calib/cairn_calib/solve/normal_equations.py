@@ -230,6 +230,8 @@ def frame_scatter(blocks: list[Block], normal: NormalEquations) -> tuple[float, 
     turned = covariance @ shares
     expected = turned - turned @ turned
     total = float(np.trace(expected, axis1=1, axis2=2).sum())
+    if total <= 0:
+        return 1.0, 0.0  # rounding is all that there is
     # A sum of squares of normal numbers with covariance M has the variance 2 trace(M M).
     spread = float(np.sqrt(2 * np.einsum("fij,fji->", expected, expected)))
     return float(np.einsum("fi,ij,fj->", pulls, covariance, pulls)) / total, spread / total

@@ -30,7 +30,7 @@ from cairn_calib.solve.board_views import BoardViews
 from cairn_calib.solve.camera_alone import camera_alone
 from cairn_calib.solve.corner_residuals import corner_data
 from cairn_calib.solve.known_fit import fit_known
-from cairn_calib.solve.normal_equations import frame_scatter, uncertainty
+from cairn_calib.solve.normal_equations import Uncertainty, frame_scatter, uncertainty
 from cairn_calib.solve.pixel_pattern import pixel_pattern
 from cairn_calib.solve.priors import single_prior, usual_priors
 from cairn_calib.solve.range_choice import choose_terms, range_spans
@@ -94,7 +94,7 @@ def solve_from(views: BoardViews, plan: SolvePlan, state: RigState, scales: Mapp
     by_corners = _solve_corners(views, plan, state, scales)
     ranged = _range_data(views, plan, by_corners.state)
     if ranged is None:
-        return Solution(views, plan, by_corners, uncertainty(by_corners.normal))
+        return Solution(views, plan, by_corners, _uncertainty(by_corners))
     # 5. Shapes of the range bias: the plan's, or those that the images determine.
     spans = range_spans(ranged, by_corners.state, views.board)
     terms = plan.range_terms or choose_terms(spans, plan.modulation_hz)
@@ -104,7 +104,7 @@ def solve_from(views: BoardViews, plan: SolvePlan, state: RigState, scales: Mapp
     # 7. Nodes.
     if terms.nodes is not None:
         adjusted = _solve_nodes(adjusted, plan)
-    return Solution(views, plan, adjusted, uncertainty(adjusted.normal), spans=spans)
+    return Solution(views, plan, adjusted, _uncertainty(adjusted), spans=spans)
 
 
 def _solve_corners(views: BoardViews, plan: SolvePlan, state: RigState, scales: Mapping[str, float]) -> Adjustment:
@@ -164,7 +164,7 @@ def _with_pixels(solution: Solution) -> Solution:
     pattern = pixel_pattern(solution.views, solution.adjustment, solution.covariance)
     if pattern is not None and pattern.smooth_m >= SMOOTH_M:
         adjusted = _solve_nodes(solution.adjustment, solution.plan)
-        solution = replace(solution, adjustment=adjusted, uncertainty=uncertainty(adjusted.normal))
+        solution = replace(solution, adjustment=adjusted, uncertainty=_uncertainty(adjusted))
         pattern = pixel_pattern(solution.views, adjusted, solution.covariance)
     return replace(solution, pattern=pattern)
 
@@ -181,11 +181,10 @@ def _with_scatter(solution: Solution) -> Solution:
             sensors = tuple(replace(each, scatter=1.0) for each in done.problem.sensors)
             again = adjust(replace(done.problem, sensors=sensors), done.state, solution.plan.noise)
             done, fits = fit_known(_scattered(again))
-        known = uncertainty(done.normal)
     except np.linalg.LinAlgError as exc:
         raise _open(exc) from exc
     scatter = done.problem.sensors[0].scatter
-    return replace(solution, adjustment=done, uncertainty=known, scatter=scatter, known=fits)
+    return replace(solution, adjustment=done, uncertainty=_uncertainty(done), scatter=scatter, known=fits)
 
 
 def _scattered(done: Adjustment) -> Adjustment:
@@ -196,7 +195,7 @@ def _scattered(done: Adjustment) -> Adjustment:
         ratio, sigma = frame_scatter(done.blocks, replace(problem, known=()).normal(done.state, done.blocks))
     except np.linalg.LinAlgError:
         ratio, sigma = frame_scatter(done.blocks, done.normal)
-    if ratio < 1 + SCATTER_SIGMAS * sigma:
+    if not ratio > 1 + SCATTER_SIGMAS * sigma:
         return done
     sensors = tuple(replace(each, scatter=ratio) for each in problem.sensors)
     return descend(replace(problem, sensors=sensors), done.state, damping=WARM)
@@ -205,6 +204,13 @@ def _scattered(done: Adjustment) -> Adjustment:
 def _adjust(problem: AdjustmentProblem, state: RigState, plan: SolvePlan) -> Adjustment:
     try:
         return adjust(problem, state, plan.noise)
+    except np.linalg.LinAlgError as exc:
+        raise _open(exc) from exc
+
+
+def _uncertainty(done: Adjustment) -> Uncertainty:
+    try:
+        return uncertainty(done.normal)
     except np.linalg.LinAlgError as exc:
         raise _open(exc) from exc
 

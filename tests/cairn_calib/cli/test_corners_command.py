@@ -113,3 +113,23 @@ def test_images_are_never_overwritten_by_pictures_of_them(tmp_path: Path) -> Non
     with pytest.raises(BadInputError, match="would overwrite"):
         main([str(tmp_path), "--board", "9x6", "--square", "0.05", "--output", str(tmp_path)])
     assert [each.name for each in tmp_path.iterdir()] == ["one.png"]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--pattern", "circles"], "a board of circles needs --disc"),
+        (["--disc", "0.03"], "--disc is of discs, and a chessboard has none"),
+        (["--pattern", "circles", "--disc", "0.06"], "0.05 m apart, got 0.06 m"),
+        (
+            ["--pattern", "circles", "--disc", "0.03"],
+            "same after half a turn.*add --upright.*asymmetric circles in odd rows",
+        ),
+        (["--board", "8x6"], "same after half a turn.*add --upright.*one with an odd and an even side"),
+    ],
+)
+def test_what_is_missing_of_a_board_is_named(tmp_path: Path, options: list[str], words: str) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((60, 80), np.uint8))
+    given = [str(tmp_path / "a.png"), "--board", "9x6", "--square", "0.05", "--output", str(tmp_path / "out"), *options]
+    with pytest.raises(BadInputError, match=words):
+        main(given)

@@ -291,3 +291,14 @@ def test_a_step_moves_the_state_by_it(solution: Solution) -> None:
     step[at] = 0.01
     there = step_state(solution.state, solution.layout, step, np.zeros((8, 6)))
     assert there.T_rig_camera[1, 1, 3] - solution.state.T_rig_camera[1, 1, 3] == pytest.approx(0.01)
+
+
+def test_images_of_other_moments_are_called_that_and_not_an_open_lens() -> None:
+    views = views_of(world(6, seed=3, names=PAIR), seed=3)
+    frames = views.frames
+    later = dict(zip(frames, [*frames[2:], *frames[:2]], strict=True))
+    mixed = tuple(replace(view, frame=later[view.frame]) if view.camera == "left" else view for view in views.views)
+    solution = solve_rig(replace(views, views=mixed), usual_plan({name: SPECTRA[name] for name in PAIR}))
+    with pytest.raises(BadInputError, match=r"images not of one moment \(look at the pairing\)") as found:
+        examine(solution, solved_rig(solution, made_s=0.0))
+    assert found.value.kind == "not_usable"

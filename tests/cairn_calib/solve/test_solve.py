@@ -271,3 +271,21 @@ def test_a_board_that_is_tilted_about_one_spot_is_not_called_reversed(seed: int)
     solution = solve_rig(views_of(truth, seed=seed), usual_plan({name: SPECTRA[name] for name in truth.names}))
     left = solution.state.T_rig_camera[list(truth.names).index("left")]
     assert np.abs(left - truth.T_rig_camera("left"))[:3, 3].max() < 0.05
+
+
+def test_corners_without_any_noise_are_solved() -> None:
+    truth = world(6, seed=2, names=PAIR)
+    solution = solve_rig(views_of(truth, seed=2, noise=0.0), pair_plan())
+    assert solution.state.T_rig_camera[1] == pytest.approx(truth.T_rig_camera("left"), abs=1e-3)
+    assert all(0 < sensor.scale < 2e-3 for sensor in solution.adjustment.problem.sensors)
+
+
+def test_a_view_whose_corners_lie_on_a_line_is_left_out() -> None:
+    views = views_of(world(6, seed=2, names=PAIR), seed=2)
+    first = next(view for view in views.views if view.camera == "left")
+    pixels = np.where((np.arange(BOARD.count) < BOARD.columns)[:, None], first.corners.pixels, np.nan)
+    row = replace(first, corners=Corners(BOARD, pixels, first.corners.covariance_px2))
+    solution = solve_rig(
+        replace(views, views=tuple(row if view is first else view for view in views.views)), pair_plan()
+    )
+    assert ("left", first.frame) not in {(view.camera, view.frame) for view in solution.views.views}

@@ -176,7 +176,7 @@ def test_the_fourth_power_is_found_at_the_image_s_corners_and_else_told_to_be_as
         truth = replace(truth, boards=boards)
         views = replace(views_of(truth, seed=4), ranges=ranges_of(truth, "tof", seed=4, sigma_m=0.006))
         solutions.append(solve_rig(views, plan))
-    near, far = ([each.text for each in warnings_of(found, [], [], None, [])] for found in solutions)
+    near, far = ([each.text for each in warnings_of(found, [], [], None, [], [], [])] for found in solutions)
     assert any("radial4_m" in text and "what was assumed before" in text for text in near)
     assert not any("radial4_m" in text for text in far)
     value, sigma = solutions[1].values()["tof", "radial4_m"], solutions[1].sigmas()["tof", "radial4_m"]
