@@ -118,9 +118,9 @@ def _import(args: argparse.Namespace) -> None:
             title = f"{document.image}: {len(document.corners)} of {board.count} corners from {path.name}"
             write_picture(args.out / f"{stem}.png", overlay(read_grey(place)[0], document.to_corners(), title=title))
         found.append(bool(document.corners))
+    points = f"{board.count} named" if board.named is not None else f"{board.columns}x{board.rows}"
     sys.stdout.write(
-        f"{args.out}: {len(found)} images, {sum(found)} with a board of {board.columns}x{board.rows} points, from "
-        f"{listed.program}\n"
+        f"{args.out}: {len(found)} images, {sum(found)} with a board of {points} points, from {listed.program}\n"
     )
     if not listed.is_named:
         sys.stderr.write(

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from cairn_calib.diagnosis.probe_points import image_grid
-from cairn_calib.exchange.rig_exchange import FORMATS, RIG, format_of_text, read_text
+from cairn_calib.exchange.rig_exchange import RIG, format_of_text, read_cameras, read_text
 from cairn_calib.rig.fisheye import FisheyeCamera
 from cairn_calib.rig.lens import Lens
 from cairn_calib.rig.rig import Rig, rig_from_json
@@ -143,9 +143,8 @@ def _parse(option: str, text: str, names: Sequence[str]) -> list[_Wish]:
 def _read(path: Path) -> dict[str, _FileLens]:
     """The lenses of a file, by name."""
     text = read_text(path)
-    source = format_of_text(path, text)
-    if source != RIG:
-        return {each.name: _FileLens(each.camera, None) for each in FORMATS[source].read(text, name=path.name).cameras}
+    if format_of_text(path, text) != RIG:
+        return {each.name: _FileLens(each.camera, None) for each in read_cameras(path, text).cameras}
     rig = rig_from_json(text.encode())
     return {
         name: _FileLens(each.camera, _stated(rig, name, each.camera))

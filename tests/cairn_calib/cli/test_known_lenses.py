@@ -134,3 +134,17 @@ def test_a_single_camera_that_is_held_leaves_nothing_to_solve(solved: tuple[Path
     options = ["--spectrum", "colour", "--output", str(tmp_path / "rig.json"), "--hold", f"{solved[0]}/last.json"]
     with pytest.raises(BadInputError, match="nothing is left to solve"):
         main(["solve", solved[1][1], *options])
+
+
+def test_a_camera_info_as_ros_prints_it_is_a_known_lens(solved: tuple[Path, list[str]], tmp_path: Path) -> None:
+    left = lens(load_rig(solved[0] / "last.json"), "left")
+    (fx, fy), (cx, cy) = left.focal_px, left.centre_px
+    message = {
+        "header": {"frame_id": "left_optical_frame"},
+        **{"height": left.height, "width": left.width, "distortion_model": "plumb_bob"},
+        **{"d": list(left.distortion), "k": [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]},
+    }
+    lines = (f"{name}: {json.dumps(value)}" for name, value in message.items())
+    (tmp_path / "info.yaml").write_text("\n".join(lines) + "\n---\n")
+    rig = solve(solved, tmp_path / "rig.json", "--hold", f"left={tmp_path}/info.yaml#left_optical_frame")
+    assert lens(rig, "left") == left
