@@ -17,6 +17,9 @@ of the folders before it.
     .mat            imagePoints, boardSize; save -v7        the same for all           imageFileNames
     .csv            image,column,row,x,y[,sigma]            sigma, pixels              yes
 
+In MATLAB: `[imagePoints, boardSize, used] = detectCheckerboardPoints(files); imageFileNames = files(used);`, then
+`save('left.mat', 'imagePoints', 'boardSize', 'imageFileNames', '-v7')`; of a stereo pair, one camera's points a file.
+
 Points with names of their own, at any places of a flat board (pins, lamps, heated dots; bright or dark): a table of
 their places for --points, and one of where each is in the images; no --board, no --square. --blobs moves a point that
 was clicked by hand to the middle of the bright or dark blob that it is on, and states how certain that is.
