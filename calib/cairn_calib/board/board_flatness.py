@@ -55,8 +55,10 @@ def flat_view(lattice: Floats, pixels: Floats, shape: tuple[int, ...]) -> FlatVi
         pixels: (N, 2) where they were found, none of them NaN.
         shape: rows and columns of the image; the lens's middle is near its middle.
     """
-    middle = np.array([shape[1] - 1, shape[0] - 1]) / 2
-    scale = float(np.hypot(*middle))
+    straight = straight_view(lattice, pixels, shape)
+    if straight is None:
+        return None
+    middle, scale = straight.centre, straight.scale_px
 
     def view(at: Floats) -> FlatView | None:
         # In units in which the image's corner is 1 from its middle, so that k is a pure number.
@@ -78,6 +80,14 @@ def flat_view(lattice: Floats, pixels: Floats, shape: tuple[int, ...]) -> FlatVi
         unknown = unknown - np.linalg.lstsq(system, np.concatenate([missed, prior @ unknown]), rcond=None)[0]
         unknown = np.clip(unknown, [RADIAL[0], -1, -1], [RADIAL[1], 1, 1])
     return view(unknown)
+
+
+def straight_view(lattice: Floats, pixels: Floats, shape: tuple[int, ...]) -> FlatView | None:
+    """View through a lens that does not bend; arguments are those of `flat_view`."""
+    middle = np.array([shape[1] - 1, shape[0] - 1]) / 2
+    scale = float(np.hypot(*middle))
+    homography = fit_homography(lattice, (pixels - middle) / scale)
+    return None if homography is None else FlatView(homography, 0.0, middle, scale)
 
 
 def flat_limit_px(cell_px: float) -> float:

@@ -46,7 +46,7 @@ def fit_board(
     # The scale: a power of 2, so that pixels are means of whole pixels.
     factor = 1 << max(0, int(np.floor(np.log2(max(_step_px(grid, board) / CELL_PX, 1.0)))))
     # Pixel centres are at whole numbers, so an image's edge is at -0.5 at every scale.
-    found = fit_grid((grid + 0.5) / factor - 0.5, _reduce(counts, factor), board)
+    found = fit_grid((grid + 0.5) / factor - 0.5, reduce_image(counts, factor), board)
     if found is None:
         return NO_FIT
     found = order(found)
@@ -61,7 +61,7 @@ def _step_px(grid: Floats, board: Board) -> float:
     return float(np.nanmedian(np.concatenate(steps)))
 
 
-def _reduce(counts: Image, factor: int) -> Image:
+def reduce_image(counts: Image, factor: int) -> Image:
     """Image of the means of squares of `factor` pixels; what is left at its right and bottom edge is cut."""
     height, width = (side // factor * factor for side in counts.shape)
     if factor == 1:
@@ -72,28 +72,45 @@ def _reduce(counts: Image, factor: int) -> Image:
 
 def _sharpen(found: FittedGrid, counts: Image, factor: int) -> Corners:
     """Corners of a grid that passed the gates at a coarse scale, from the finest one at which their edges are sharp."""
-    board, signs = found.board, checker_signs(found.board)
-    coarse = found.fitted
+    board, lattice = found.board, found.board.lattice()
+    pixels = (found.fitted.pixels + 0.5) * factor - 0.5
+    homography = fit_homography(lattice[found.kept], pixels[found.kept])
+    if factor == 1 or homography is None:
+        return Corners(board, pixels, found.fitted.covariance_px2 * factor**2)
+    # Corners that the coarse scale lost at the image's border are searched where the others predict them.
+    guesses = np.where(found.kept[:, None], pixels, _predict(homography, lattice, pixels, found.kept))
+    steps = steps_between(homography, lattice)
+    return Corners(
+        board, *fit_sharpest(counts, found.fitted, guesses, steps, signs=checker_signs(board), factor=factor)
+    )
+
+
+def fit_sharpest(
+    counts: Image, coarse: FittedCorners, guesses: Floats, steps: Floats, *, signs: Floats, factor: int
+) -> tuple[Floats, Floats]:
+    """Pixels (N, 2) and covariance (N, 2, 2) of corners at the finest scale at which their edges are sharp.
+
+    Args:
+        counts: (H, W) image as recorded.
+        coarse: the corners as fitted in the image that is reduced by `factor`.
+        guesses: (N, 2) pixels of the image as recorded, also of corners that are not in `coarse`; NaN for none.
+        steps: (N, 2, 2) its pixels to the next column and row.
+        signs: as of `sound_corners`.
+        factor: a power of 2.
+    """
     pixels, covariance = (coarse.pixels + 0.5) * factor - 0.5, coarse.covariance_px2 * factor**2
     # From the image as recorded to coarser ones, until edges are sharp enough for a window.
     finer = 1
     while finer < factor:
-        image = _reduce(counts, finer)
-        guesses = (pixels + 0.5) / finer - 0.5
-        homography = fit_homography(board.lattice()[found.kept], guesses[found.kept])
-        if homography is None:
-            break
-        # Corners that the coarse scale lost at the image's border are searched where the others predict them.
-        guesses = np.where(found.kept[:, None], guesses, _predict(homography, board.lattice(), guesses, found.kept))
-        fitted = fit_corners(image, guesses, steps_between(homography, board.lattice()))
+        fitted = fit_corners(reduce_image(counts, finer), (guesses + 0.5) / finer - 0.5, steps / finer)
         # A corner that is not sound at this scale keeps its place from the coarse one.
         sound = sound_corners(fitted, signs) & (fitted.moved < LIKE_MOVED)
-        if sound.sum() >= found.kept.sum() / 2 and np.median(fitted.blur_px[sound]) <= SHARP_PX:
+        if 2 * sound.sum() >= np.isfinite(coarse.pixels[:, 0]).sum() and np.median(fitted.blur_px[sound]) <= SHARP_PX:
             pixels = np.where(sound[:, None], (fitted.pixels + 0.5) * finer - 0.5, pixels)
             covariance = np.where(sound[:, None, None], fitted.covariance_px2 * finer**2, covariance)
             break
         finer *= 2
-    return Corners(board, pixels, covariance)
+    return pixels, covariance
 
 
 def fit_grid(grid: Floats, counts: Image, board: Board) -> FittedGrid | None:

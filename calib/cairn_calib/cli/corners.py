@@ -34,6 +34,14 @@ first row, end of last row, start of last row, and pass the file as `--outer-cor
 
 For grids of discs say `--pattern circles` or `asymmetric-circles`; `--square` is then from disc to disc, and `--disc`
 their diameter: the centroid of a tilted disc's image is not its centre's, which `cairn calib solve` must know.
+
+Boards with tags may be seen in part, and any way up: tags name the corners. Of OpenCV's ChArUco board `--board` counts
+squares, and `--marker` is the edge of a tag. Of Kalibr's AprilGrid it counts tags, `--square` is the edge of a tag from
+black to black (`tagSize`), `--spacing` the gap over that edge (`tagSpacing`):
+
+    $ cairn calib corners left/*.png --pattern charuco --board 11x8 --square 0.03 --marker 0.022 --tags 5x5_100 ...
+    $ cairn calib corners left/*.png --pattern aprilgrid --board 6x6 --square 0.088 --spacing 0.3 ...
+
 If no board was found in any image, that is an error (exit code 3).
 """
 
@@ -45,11 +53,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
-from pydantic import ValidationError
-
-from cairn_calib.board.board import Board, Polarity, board_size
+from cairn_calib.board.board import Polarity
 from cairn_calib.board.corner_file import read_outer_corners
 from cairn_calib.board.polarity import count_votes
+from cairn_calib.cli.board_options import add_board_options, board_by_options
 from cairn_calib.corner_search.corner_folder import document_path, image_name, picture_path, write_outcome
 from cairn_calib.corner_search.image_search import (
     BoardSearch,
@@ -61,7 +68,7 @@ from cairn_calib.corner_search.image_search import (
 )
 from cairn_calib.corner_search.search_workers import search_images
 from cairn_map.arrays import Floats
-from cairn_map.errors import BadInputError, CairnError, NotFoundError, first_error
+from cairn_map.errors import BadInputError, CairnError, NotFoundError
 from cairn_map.progress import with_passing_progress
 
 NAMED_MAX = 8
@@ -96,13 +103,8 @@ def _add_arguments(corners: argparse.ArgumentParser) -> None:
         metavar="IMAGE",
         help="PNG, JPEG, TIFF, 8 or 16 bits; folder: a still pose",
     )
-    corners.add_argument("--board", required=True, metavar="COLUMNSxROWS", help="inner corners, such as 9x6")
-    corners.add_argument("--square", type=float, required=True, metavar="METRES", help="edge of a cell")
+    add_board_options(corners)
     corners.add_argument("--output", type=Path, required=True, metavar="DIR", help="for the documents and pictures")
-    corners.add_argument(
-        "--pattern", choices=("chessboard", "circles", "asymmetric-circles"), default="chessboard", help="(chessboard)"
-    )
-    corners.add_argument("--disc", type=float, metavar="METRES", help="diameter of a disc, for grids of discs")
     corners.add_argument(
         "--polarity",
         choices=("vote", "normal", "reversed"),
@@ -119,7 +121,7 @@ def _add_arguments(corners: argparse.ArgumentParser) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    board = _board(args)
+    board = board_by_options(args)
     pointed = read_outer_corners(args.outer_corners, board) if args.outer_corners else {}
     names = [image_name(path) for path in args.images]
     twice = sorted({name for name in names if names.count(name) > 1})
@@ -208,35 +210,6 @@ def _jobs(jobs: int | None) -> int:
     if jobs is not None and jobs < 1:
         raise BadInputError("bad_arguments", f"--jobs is a number of processes, at least 1, got {jobs}")
     return jobs or os.cpu_count() or 1
-
-
-def _board(args: argparse.Namespace) -> Board:
-    columns, rows = board_size(args.board)
-    if not 0 < args.square <= 100:
-        raise BadInputError("bad_board", f"--square is an edge in metres, above 0 and at most 100, got {args.square}")
-    if args.pattern != "chessboard" and args.disc is None:
-        raise BadInputError(
-            "bad_board", f"a board of {args.pattern} needs --disc, the diameter of its discs in metres: --disc 0.03"
-        )
-    if args.pattern == "chessboard" and args.disc is not None:
-        raise BadInputError(
-            "bad_board", "--disc is of discs, and a chessboard has none: leave it out, or say --pattern circles"
-        )
-    try:
-        board = Board(pattern=args.pattern, columns=columns, rows=rows, pitch_m=args.square, disc_m=args.disc)
-    except ValidationError as exc:
-        raise BadInputError("bad_board", f"--disc: {first_error(exc)}") from exc
-    if board.has_turn_symmetry and not args.upright and args.outer_corners is None:
-        better = (
-            "one with an odd and an even side" if args.pattern == "chessboard" else "asymmetric circles in odd rows"
-        )
-        raise BadInputError(
-            "board_turns",
-            f"a board of {args.board} {args.pattern} looks the same after half a turn, so that no image shows which of "
-            "its points is the first: add --upright if its rows always run along the images' rows, left to right (for "
-            f"a rig of one camera any point may be the first: add it, too), or use another board: {better}",
-        )
-    return board
 
 
 def _polarity(results: Sequence[SearchedImage], args: argparse.Namespace) -> Polarity:

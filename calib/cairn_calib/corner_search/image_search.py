@@ -24,6 +24,7 @@ from cairn_calib.board.polarity import (
     reverse_corners,
 )
 from cairn_calib.board.still_frames import StillImage, read_still, refuse_movement
+from cairn_calib.corner_search.coded_search import coded_candidates
 from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError, DamagedDataError
 
@@ -167,9 +168,11 @@ def _earlier(task: ImageTask, image: StillImage) -> CornerFile | None:
 
 def _candidates(image: StillImage, task: ImageTask) -> PolarityCandidates:
     search = task.search
-    look: Callable[..., PolarityCandidates] = (
-        chessboard_candidates if search.board.pattern == "chessboard" else disc_candidates
-    )
+    look: Callable[..., PolarityCandidates] = disc_candidates
+    if search.board.pattern == "chessboard":
+        look = chessboard_candidates
+    if search.board.has_tags:
+        look = coded_candidates
     try:
         found = look(image.counts, search.board, polarity=search.polarity, upright=search.upright, pointed=task.pointed)
         return found.filter(lambda detection: refuse_movement(image, detection))
