@@ -41,8 +41,10 @@ NEAR_PITCHES = 1.6
 """Pitches from what is known within which corners are searched next."""
 BENDING_MIN = 16
 """Known places from which the bending of the lens is estimated."""
-NEIGHBOURS, PASSES = 4, 6
-"""Nearest corners with which a corner's miss is compared, and rounds in which the worst are taken out, at most."""
+NEIGHBOURS, SLOPE_RIDGE = 8, 0.3
+"""Nearest corners whose misses predict one, and the weight with which their change from pitch to pitch is held at 0."""
+PASSES = 6
+"""Rounds in which the worst corners are taken out, at most."""
 ROUNDS = 40
 """Rounds of growth, at most: a board's longest side in pitches."""
 SEEN_MIN = 6
@@ -187,17 +189,35 @@ def corner_signs(board: Board) -> Floats:
 def _predict(lattice: Floats, anchors: Floats, at: Floats, shape: tuple[int, ...]) -> tuple[Floats, Floats]:
     """(N, 2) pixels and (N, 2, 2) steps of a pitch of places of the lattice; NaN where the anchors do not tell.
 
-    A flat board behind a lens that is fitted to all anchors, plus the miss of the nearest one.
+    A flat board behind a lens that is fitted to all anchors, plus the misses of those next to the place.
     """
     find = flat_view if len(anchors) >= BENDING_MIN else straight_view
     view = find(anchors, at, shape)
     if view is None:
         return np.full_like(lattice, np.nan), np.tile(np.eye(2), (len(lattice), 1, 1))
-    nearest = np.linalg.norm(lattice[:, None] - anchors[None], axis=2).argmin(axis=1)
+    away = np.linalg.norm(lattice[:, None] - anchors[None], axis=2)
     half = 0.5 * np.eye(2)
     steps = np.stack([view.pixels(lattice + h) - view.pixels(lattice - h) for h in half], axis=1)
     steps[~np.isfinite(steps).all(axis=(1, 2))] = np.eye(2)
-    return view.pixels(lattice) + (at - view.pixels(anchors))[nearest], steps
+    return view.pixels(lattice) + _misses_near(lattice, anchors, at - view.pixels(anchors), away), steps
+
+
+def _misses_near(places: Floats, anchors: Floats, misses: Floats, away: Floats) -> Floats:
+    """(N, 2) misses at places: those of the nearest anchors, linear in the lattice, flat where these leave that open.
+
+    Args:
+        places: (N, 2)
+        anchors: (M, 2)
+        misses: (M, 2) pixels.
+        away: (N, M) distance from place to anchor; infinite for an anchor that must not count.
+    """
+    near = np.argsort(away, axis=1, kind="stable")[:, :NEIGHBOURS]
+    apart = anchors[near] - places[:, None]
+    terms = np.concatenate([np.ones((*apart.shape[:2], 1)), apart], axis=2)
+    transposed = np.swapaxes(terms, 1, 2)
+    # Least squares at each place, whose value there is the first unknown; the ridge holds slopes that nothing tells.
+    normal = transposed @ terms + np.diag([1e-6, SLOPE_RIDGE, SLOPE_RIDGE])
+    return np.asarray(np.linalg.solve(normal, transposed @ misses[near])[:, 0], np.float64)
 
 
 def _lies_among_others(lattice: Floats, found: Floats, shape: tuple[int, ...]) -> Flags:
@@ -212,8 +232,7 @@ def _lies_among_others(lattice: Floats, found: Floats, shape: tuple[int, ...]) -
         missed = found[kept] - view.pixels(lattice[kept])
         away = np.linalg.norm(lattice[kept][:, None] - lattice[kept][None], axis=2)
         away[np.diag_indices(len(kept))] = np.inf
-        near = np.argsort(away, axis=1, kind="stable")[:, :NEIGHBOURS]
-        off_px = np.linalg.norm(missed - np.median(missed[near], axis=1), axis=1)
+        off_px = np.linalg.norm(missed - _misses_near(lattice[kept], lattice[kept], missed, away), axis=1)
         half = np.array([[0.5, 0.0]])
         pitch_px = np.linalg.norm(view.pixels(lattice[kept] + half) - view.pixels(lattice[kept] - half), axis=1)
         off = off_px / (OFF_PX + OFF_PITCHES * pitch_px)

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -23,6 +23,7 @@ from cairn_calib.board.board import Board
 from cairn_calib.board.corner_detection import grey
 from cairn_calib.board.corners import Corners, Detection
 from cairn_calib.corner_search.coded_search import coded_candidates
+from cairn_calib.rig.fisheye import FisheyeCamera
 from cairn_map.errors import BadInputError
 
 TAG36H11 = (0xD5D628584, 0xD97F18B49, 0xDD280910E, 0xE479E9C98, 0xEBCBCA822)
@@ -175,6 +176,24 @@ def test_a_board_of_before_opencv_4_6_is_known_by_its_tags() -> None:
     corners = found(sheet_picture(COLOUR, T, sheet, rng), CHARUCO)
     assert corners.seen.sum() > 35
     assert np.nanmax(np.abs(corners.pixels - sheet_truth(COLOUR, T, sheet))) < 0.1
+
+
+@pytest.mark.slow
+def test_a_lens_that_bends_the_sheet_hides_little_of_it() -> None:
+    lens = FisheyeCamera(
+        width=1280,
+        height=960,
+        focal_px=(420.0, 420.0),
+        centre_px=(640.0, 480.0),
+        distortion=(-0.02, 0.005, -0.002, 0.0),
+    )
+    spectrum, (sheet, board) = replace(COLOUR, camera=lens), SHEETS["aprilgrid"]
+    rng = np.random.default_rng(2)
+    for _ in range(3):
+        T = sheet_pose(rng, spectrum, sheet, range_m=(0.3, 0.7))
+        corners, at = found(sheet_picture(spectrum, T, sheet, rng), board), sheet_truth(spectrum, T, sheet)
+        assert corners.seen.sum() > 0.85 * board.count
+        assert np.nanmax(np.abs(corners.pixels - at)) < 0.15
 
 
 def shot_of(sheet: Sheet) -> Image:
