@@ -90,9 +90,12 @@ def pairing_table(frames: Mapping[str, Sequence[str]], examples: Mapping[str, st
     rows += [(name, str(len(own)), examples.get(name, ""), shortened(own)) for name, own in frames.items()]
     camera, example = (max(len(row[column]) for row in rows) for column in (0, 2))
     lines = [f"{row[0]:<{camera}}  {row[1]:>6}  {row[2]:<{example}}  {row[3]}" for row in rows]
-    pairs = [f"{one} and {two} {len({*frames[one]} & {*frames[two]})}" for one, two in combinations(frames, 2)]
-    if pairs:
-        lines.append(f"frames that both saw: {', '.join(pairs)}")
+    shared = {pair: len({*frames[pair[0]]} & {*frames[pair[1]]}) for pair in combinations(frames, 2)}
+    if len(shared) > 1 and len(set(shared.values())) == 1:
+        lines.append(f"frames that any two of them both saw: {next(iter(shared.values()))}")
+    elif shared:
+        told = (f"{one} and {two} {count}" for (one, two), count in shared.items())
+        lines.append(f"frames that both saw: {', '.join(told)}")
     return "\n".join(line.rstrip() for line in lines) + "\n"
 
 

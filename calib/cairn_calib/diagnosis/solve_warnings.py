@@ -270,7 +270,10 @@ def _of_discs(solution: Solution) -> Iterator[SolveWarning]:
 
 def _of_mode(mode: WeakMode) -> Iterator[SolveWarning]:
     if mode.sigma_px > MODE_PX:
-        text = f"points may be off by {mode.sigma_px:.2g} px, for {mode.words} are open together: {mode.advice}"
+        text = (
+            f"points may be off by {mode.sigma_px:.2g} px (root mean square over the image), for {mode.words} are open "
+            f"together: {mode.advice}"
+        )
         yield SolveWarning("weak_mode", mode.camera, mode.sigma_px, MODE_PX, "px where the gauge's pixels appear", text)
 
 

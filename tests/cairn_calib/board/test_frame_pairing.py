@@ -107,3 +107,5 @@ def test_the_table_counts_the_frames_that_two_cameras_share() -> None:
         "right        2                   9, 10",
         "frames that both saw: left and right 2",
     ]
+    three = pairing_table({name: ["1", "2"] for name in ("a", "b", "c")}, {})
+    assert three.splitlines()[-1] == "frames that any two of them both saw: 2"
