@@ -14,7 +14,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import zstandard
@@ -170,7 +170,10 @@ def with_children(pid: int) -> list[int]:
 
 def cpu_s_of(pids: Iterable[int]) -> float:
     """Processor time of processes so far, with that of their children that ended."""
-    stats = [Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split() for pid in pids]
+    stats = []
+    for pid in pids:
+        with suppress(FileNotFoundError):  # it ended meanwhile, and its parent counts it now
+            stats.append(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split())
     return sum(sum(map(int, fields[11:15])) for fields in stats) / os.sysconf("SC_CLK_TCK")
 
 

@@ -18,7 +18,8 @@ arrival, so that a server would refuse for ever what another one, or the same on
 (decision 021). Any order of the same commits gives the same cells, and each entry of the log is all of one commit.
 """
 
-from collections.abc import Container
+from collections.abc import Callable, Container
+from functools import cache
 from typing import NamedTuple
 
 from cairn_map.codec.cell_reading import cell_reader
@@ -53,16 +54,23 @@ def slice_s(size_bytes: int) -> float:
     return min(max(SLICE_S, SLICE_S_PER_BYTE * size_bytes), SLICE_MAX_S)
 
 
-def commit_work_s(commit: StoredCommit, snapshot: Snapshot, cached: Container[CellKey]) -> float:
-    """Estimated work of folding a commit or taking it out; `cached` are the cells that need not be decoded."""
-    seconds = 0.0
-    for key, body in commit.diff.items():
-        seconds += CELL_S + _diff_work_s(body)
+def commit_work_s(commit: StoredCommit, decoding_s: Callable[[CellKey], float]) -> float:
+    """Estimated work of folding a commit or taking it out; `decoding_s` is that of the map's cells (`decoding_of`)."""
+    return sum(CELL_S + _diff_work_s(body) + decoding_s(key) for key, body in commit.diff.items())
+
+
+def decoding_of(snapshot: Snapshot, cached: Container[CellKey]) -> Callable[[CellKey], float]:
+    """Work of decoding a cell of the map for one fold alone, seconds; each is read once, none of those `cached`."""
+
+    @cache
+    def seconds(key: CellKey) -> float:
         stored = None if key in cached else snapshot.cell(key)
-        if stored is not None:
-            work_s, sums_bytes = _work_s(stored.body)
-            # Any other cell stays decoded after the fold.
-            seconds += work_s if sums_bytes > HELD_PER_BYTE * len(stored.body) else 0.0
+        if stored is None:
+            return 0.0
+        work_s, sums_bytes = _work_s(stored.body)
+        # Any other cell stays decoded after the fold.
+        return work_s if sums_bytes > HELD_PER_BYTE * len(stored.body) else 0.0
+
     return seconds
 
 
@@ -105,6 +113,8 @@ class RetractPart(NamedTuple):
 
 def part_of(commit: StoredCommit, snapshot: Snapshot) -> RetractPart:
     """Next part of what a commit names: within the bounds, or one commit of any size."""
+    if not commit.retracts:
+        return RetractPart((), frozenset(), None)
     start = commit.due_from or 0
     named = snapshot.named(commit.retracts[start : start + PART_NAMES_MAX])
     count = cells = bricks = 0

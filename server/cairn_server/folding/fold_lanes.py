@@ -7,7 +7,7 @@ Which robot's costly commits are next is decided as in `fold_turns`, by the time
 """
 
 import logging
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -16,11 +16,20 @@ from cairn_map.errors import DamagedDataError
 from cairn_map.evidence.grid import CellKey
 from cairn_server.folding.background_plan import BackgroundPlan
 from cairn_server.folding.cell_cache import CellCache
-from cairn_server.folding.commit_work import NAME_S, SLICE_S, SLICE_S_PER_BYTE, commit_work_s, part_of, slice_s
+from cairn_server.folding.commit_work import (
+    NAME_S,
+    SLICE_S,
+    SLICE_S_PER_BYTE,
+    commit_work_s,
+    decoding_of,
+    part_of,
+    slice_s,
+)
 from cairn_server.folding.fold_memory import FoldMemory
 from cairn_server.folding.fold_turns import FoldTurns
 from cairn_server.folding.folding import FoldStore
 from cairn_server.store.objects.cold_bytes import AwayError
+from cairn_server.store.store import Snapshot
 from cairn_server.store.store_rows import MapRow, StoredCommit
 
 log = logging.getLogger(__name__)
@@ -46,6 +55,14 @@ class PlanOutcome(NamedTuple):
     """Count of its commits that are folded."""
     left: tuple[StoredCommit, ...] = ()
     """Those that wait for bytes in an object store, which does not answer."""
+
+
+class _Weighing(NamedTuple):
+    """A state of a map, on which commits are weighed."""
+
+    snapshot: Snapshot
+    decoding_s: Callable[[CellKey], float]
+    """`commit_work.decoding_of`."""
 
 
 class FoldLanes:
@@ -104,8 +121,11 @@ class FoldLanes:
         self._known_costly.difference_update(commit.number for commit in plan.commits)
         return PlanOutcome(len(plan.commits))
 
-    def cheap(self, row: MapRow, commits: Sequence[StoredCommit], cache: CellCache) -> list[StoredCommit]:
+    def cheap(
+        self, row: MapRow, commits: Sequence[StoredCommit], cache: CellCache, snapshot: Snapshot
+    ) -> list[StoredCommit]:
         """Those of a map's pending commits that may be folded now; the costly ones are remembered for `plan_next`."""
+        weighing = _Weighing(snapshot, decoding_of(snapshot, cache))
         self._costly = {}
         found: list[StoredCommit] = []
         behind: set[RobotName] = set()
@@ -129,7 +149,7 @@ class FoldLanes:
                 continue
             # The plan's ground: neither what it takes out, nor what it notes to be taken out, may change.
             is_held = commit.id in named or not named.isdisjoint(commit.retracts)
-            weight = None if is_held else self._weight(row, commit, cache, held)
+            weight = None if is_held else self._weight(row, commit, weighing, held)
             if weight is None:
                 behind.add(robot)
                 continue
@@ -153,12 +173,14 @@ class FoldLanes:
         robot = min(self._costly, key=lambda robot: (turns.spent_s(robot), self._costly[robot][0].number))
         chosen: list[StoredCommit] = []
         work_s = 0.0
-        for commit in self._costly[robot]:
-            weight = self._weight(row, commit, CellCache(row.geometry), held=())
-            work_s += weight.work_s if weight is not None else 0.0
-            if chosen and work_s > PLAN_S:
-                break
-            chosen.append(commit)
+        with self._store.snapshot(row) as snapshot:
+            weighing = _Weighing(snapshot, decoding_of(snapshot, cached=()))
+            for commit in self._costly[robot]:
+                weight = self._weight(row, commit, weighing, held=())
+                work_s += weight.work_s if weight is not None else 0.0
+                if chosen and work_s > PLAN_S:
+                    break
+                chosen.append(commit)
         try:
             self._plan = BackgroundPlan(self._store, row, chosen, self._memory, cells_bytes=self._cells_bytes)
         except DamagedDataError:
@@ -169,16 +191,17 @@ class FoldLanes:
         self._unplanned.update(map(_piece, commits))
         self._known_costly.difference_update(commit.number for commit in commits)
 
-    def _weight(self, row: MapRow, commit: StoredCommit, cache: CellCache, held: Collection[CellKey]) -> _Weight | None:
+    def _weight(
+        self, row: MapRow, commit: StoredCommit, weighing: _Weighing, held: Collection[CellKey]
+    ) -> _Weight | None:
         """Weight of a commit, from `PLAN_S` on not all of it; None if it changes one of the `held` cells."""
         own = commit if commit.due_from is None else replace(commit, diff={})
         size_bytes = sum(map(len, own.diff.values()))
         try:
-            with self._store.snapshot(row) as snapshot:
-                part = part_of(commit, snapshot)
-                if not (part.cells.isdisjoint(held) and own.diff.keys().isdisjoint(held)):
-                    return None
-                work_s = NAME_S * len(part.named) + commit_work_s(own, snapshot, cache)
+            part = part_of(commit, weighing.snapshot)
+            if not (part.cells.isdisjoint(held) and own.diff.keys().isdisjoint(held)):
+                return None
+            work_s = NAME_S * len(part.named) + commit_work_s(own, weighing.decoding_s)
             # What is taken out is read one by one, and not all of it if it is much.
             for target in part.targets:
                 if work_s > PLAN_S:
@@ -186,8 +209,7 @@ class FoldLanes:
                 known = self._store.folded(row, target)
                 if known is not None:
                     size_bytes += sum(map(len, known.diff.values()))
-                    with self._store.snapshot(row) as snapshot:
-                        work_s += commit_work_s(known, snapshot, cache)
+                    work_s += commit_work_s(known, weighing.decoding_s)
         except (DamagedDataError, AwayError):
             return _Weight(0.0, size_bytes)  # a cell that cannot be read: folding finds it
         return _Weight(work_s, size_bytes)

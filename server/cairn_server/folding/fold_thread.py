@@ -4,14 +4,15 @@ import logging
 import secrets
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 
 from cairn_map.errors import CairnError
 from cairn_server.folding.damaged_cells import DamagedCells
 from cairn_server.folding.fold_memory import FoldMemory
 from cairn_server.folding.fold_process import FoldProcess, LostProcessError
-from cairn_server.folding.group_folding import Folded, LocalFolding
+from cairn_server.folding.fold_turns import GROUP_S
+from cairn_server.folding.group_folding import GROUP_MAX, Folded, LocalFolding
 from cairn_server.folding.readiness import FoldHealth
 from cairn_server.store.store import Store
 from cairn_server.store.store_rows import MapRow
@@ -19,12 +20,16 @@ from cairn_server.store.store_rows import MapRow
 log = logging.getLogger(__name__)
 
 REST_SHARE, REST_MAX_S = 3.0, 0.5
-"""While robots push, each fold is followed by a rest of `REST_SHARE` times its length, at most `REST_MAX_S`. Commits
-that come in it are folded together, each cell encoded once: encoding 15 cells takes 30 ms, for one scan or for 200;
-merging a scan takes 1 ms."""
+"""While robots push, each fold is followed by a rest of its map, `REST_SHARE` times its length, at most `REST_MAX_S`.
+Commits that come in it are folded together, each cell encoded once: encoding 15 cells takes 30 ms, for one scan or for
+200; merging a scan takes 1 ms."""
+OFTEN_S = 1.0
+"""A map that is folded again within this time has robots that push."""
+REST_LOOK_S = 0.05
+"""Time between two looks for commits to other maps while those with commits rest."""
 POLL_S = 0.2
 """Time between two looks for commits that came by another server of the same store."""
-CLAIM_MAX = 16
+CLAIM_MAX = 4
 """Maps that are claimed at a time, so that processes that fold together share them by how fast they are."""
 LOOK_S = 0.02
 """Time between two looks at a plan in the background."""
@@ -77,6 +82,7 @@ class FoldThread:
         self._process = process
         self._local = LocalFolding(store, damaged, memory)
         self._holder = secrets.token_hex(8)
+        self._rests = _Rests()
         self._wake.set()
         self._thread = threading.Thread(target=self._run, name="cairn-fold", daemon=True)
         self._thread.start()
@@ -120,20 +126,20 @@ class FoldThread:
         """Fold until nothing is pending, one group of each map in turn; False if a map failed."""
         failed: set[str] = set()
         maps: list[MapRow] = []
+        rests = self._rests
         busy, planning = True, False
-        while (busy or planning) and not self._closing.is_set():
-            # A plan in the background does not report its end.
+        while (busy or planning or rests) and not self._closing.is_set():
+            # A plan in the background does not report its end. Nor is a map that rests a reason to let others wait.
             if not busy:
-                self._wake.wait(LOOK_S)
+                (self._wake if planning else self._closing).wait(LOOK_S if planning else rests.left_s())
             # Cleared before the look, so that a commit that comes during it wakes the thread again; and only if it was
             # set: a commit that comes when the wait has just ended would wait for the plan otherwise.
             is_woken = self._wake.is_set()
             if is_woken:
                 self._wake.clear()
-            is_news = busy or is_woken
+            is_news = busy or is_woken or bool(rests)
             busy = False
-            start_s = time.monotonic()
-            self._watch_clocks(start_s)
+            self._watch_clocks(time.monotonic())
             try:
                 maps = self._maps_at_work(maps if planning else [])
             except Exception:
@@ -141,9 +147,10 @@ class FoldThread:
                 return False
             planning = False
             # One group of each map in turn: a busy map does not hold up the others.
-            for row in maps:
+            for row in rests.awake(maps):
                 if row.name in failed or self._closing.is_set():
                     continue
+                start_s = time.monotonic()
                 try:
                     folded = self._fold_group(row, is_news=is_news)
                     busy |= folded.commits > 0
@@ -154,9 +161,20 @@ class FoldThread:
                     log.error("map %s: fold failed, to be tried again: %s", row.name, exc, exc_info=_unexpected(exc))
                     failed.add(row.name)
                     self._health.failed(row.name, exc)
-            if busy:
-                self._closing.wait(rest_s(time.monotonic() - start_s, is_pushed=self._wake.is_set()))
+                    continue
+                if folded.commits:
+                    took_s = time.monotonic() - start_s
+                    is_pushed = self._wake.is_set() or self._is_pushed_elsewhere(row, folded, took_s)
+                    rests.begin(row, rest_s(took_s, is_pushed=is_pushed))
         return not (failed or self._forget_old())
+
+    def _is_pushed_elsewhere(self, row: MapRow, folded: Folded, took_s: float) -> bool:
+        """True if other servers of the store take commits of a map: they do not wake this thread, but its folds tell.
+
+        A group that ended by its bounds left some, which may be folded at once.
+        """
+        is_whole = folded.commits < GROUP_MAX and took_s < GROUP_S
+        return self._store.leases is not None and is_whole and self._rests.is_often(row)
 
     def _maps_at_work(self, planned: list[MapRow]) -> list[MapRow]:
         """Maps with commits to be folded, and those of which some are planned in the background."""
@@ -228,6 +246,42 @@ class FoldThread:
                 self._process.close()
                 self._process = None
         return self._local.fold(row, is_news=is_news)
+
+
+class _Rests:
+    """Maps that rest after a fold, so that commits come together."""
+
+    def __init__(self) -> None:
+        self._until_s: dict[int, float] = {}
+        """Steady time at which each rest ends, by the number of the map."""
+        self._folded_s: dict[int, float] = {}
+        """Steady time of the last fold of each map that was folded of late."""
+
+    def __bool__(self) -> bool:
+        return bool(self._until_s)
+
+    def is_often(self, row: MapRow) -> bool:
+        """True if a map was folded less than `OFTEN_S` ago."""
+        return time.monotonic() - self._folded_s.get(row.number, -OFTEN_S) < OFTEN_S
+
+    def begin(self, row: MapRow, seconds: float) -> None:
+        """Note that a map was folded, and let it rest from now on."""
+        now_s = time.monotonic()
+        self._folded_s = {number: folded_s for number, folded_s in self._folded_s.items() if now_s - folded_s < OFTEN_S}
+        self._folded_s[row.number] = now_s
+        if seconds > 0:
+            self._until_s[row.number] = now_s + seconds
+
+    def awake(self, maps: Sequence[MapRow]) -> list[MapRow]:
+        """Those of these maps that do not rest; rests that are over are forgotten."""
+        now_s = time.monotonic()
+        self._until_s = {number: until_s for number, until_s in self._until_s.items() if until_s > now_s}
+        return [row for row in maps if row.number not in self._until_s]
+
+    def left_s(self) -> float:
+        """Time until the next rest ends, or until others should be looked for."""
+        next_s = min(self._until_s.values(), default=0.0) - time.monotonic()
+        return min(max(next_s, 0.0), REST_LOOK_S)
 
 
 def rest_s(took_s: float, *, is_pushed: bool) -> float:

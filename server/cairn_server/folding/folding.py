@@ -11,7 +11,7 @@ bytes are damaged at rest is set aside, so that it does not hold up the others; 
 
 import logging
 from collections.abc import Callable, Collection, Iterable, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
@@ -30,12 +30,12 @@ from cairn_server.folding.commit_work import part_of
 from cairn_server.store.objects.cold_bytes import AwayError
 from cairn_server.store.stamps import CellStamps
 from cairn_server.store.store import Snapshot
-from cairn_server.store.store_rows import CellRow, Entry, Fold, MapRow, RetractStep, StoredCommit
+from cairn_server.store.store_rows import CellRow, Entry, Fold, MapRow, NamedCommit, RetractStep, StoredCommit
 
 log = logging.getLogger(__name__)
 
-Order = Callable[[Sequence[StoredCommit]], Iterable[StoredCommit]]
-"""Order in which the commits of a group are folded; it may leave some for the next group."""
+Order = Callable[[Sequence[StoredCommit], Snapshot], Iterable[StoredCommit]]
+"""Order in which the commits of a group are folded on a state of the map; it may leave some for the next group."""
 GROUP_BYTES_MAX = 64 << 20
 """Most bytes of the commits folded at once; a single larger commit is folded alone."""
 
@@ -112,8 +112,13 @@ class GroupOutcome(NamedTuple):
     """Numbers of those that stay pending (`Fold.left`)."""
 
 
+def as_they_came(commits: Sequence[StoredCommit], snapshot: Snapshot) -> Iterable[StoredCommit]:
+    """All commits, in their order."""
+    return commits
+
+
 def fold_commits(
-    store: FoldStore, row: MapRow, cache: CellCache, commits: Sequence[StoredCommit], *, order: Order = iter
+    store: FoldStore, row: MapRow, cache: CellCache, commits: Sequence[StoredCommit], *, order: Order = as_they_came
 ) -> GroupOutcome:
     """Fold these pending commits, or those of them that `order` yields.
 
@@ -122,19 +127,17 @@ def fold_commits(
     """
     if not commits:
         return GroupOutcome()
-    with store.snapshot(row) as snapshot:
-        head = snapshot.head
-        folded = {each.id for each in snapshot.named([commit.id for commit in commits]) if each.is_folded}
-    # Another folding may have taken some of them since `pending`, and its head is our base; of a retract under way
-    # `store.fold` finds out.
-    commits = [commit for commit in commits if commit.due_from is not None or commit.id not in folded]
-    if not commits:
-        return GroupOutcome()
-    # Plan in memory, and write all of it or nothing.
-    cache.begin(head)
     written = False
     try:
-        fold = plan_fold(store, row, head, order(commits), cache)
+        with store.snapshot(row) as snapshot:
+            named = snapshot.named([commit.id for commit in commits])
+            # Another folding may have taken some of them since `pending`, and its head is our base; of a retract under
+            # way `store.fold` finds out.
+            folded = {each.id for each in named if each.is_folded}
+            commits = [commit for commit in commits if commit.due_from is not None or commit.id not in folded]
+            # Plan in memory, and write all of it or nothing.
+            cache.begin(snapshot.head)
+            fold = plan_fold(store, row, snapshot.head, order(commits, snapshot), cache, snapshot=snapshot, named=named)
         is_empty = not (fold.entries or fold.damaged or fold.steps)  # all of them are left for later
         written = is_empty or store.fold(row, fold)
     finally:
@@ -154,9 +157,29 @@ def audit_damaged(store: FoldStore, row: MapRow, fold: Fold) -> None:
         store.audit("damaged_commit", f"map {row.name}: commit number {number} is set aside: {why}")
 
 
-def plan_fold(store: FoldStore, row: MapRow, head: Cursor, commits: Iterable[StoredCommit], cache: CellCache) -> Fold:
-    """Plan of folding these commits on top of `head`, the state of the cells in `cache`."""
-    plan = _Plan(store, row, cache, head)
+def plan_fold(
+    store: FoldStore,
+    row: MapRow,
+    head: Cursor,
+    commits: Iterable[StoredCommit],
+    cache: CellCache,
+    *,
+    snapshot: Snapshot | None = None,
+    named: Iterable[NamedCommit] = (),
+) -> Fold:
+    """Plan of folding these commits on top of `head`, the state of the cells in `cache`.
+
+    Args:
+        store: of the map.
+        row: the map.
+        head: the state.
+        commits: in their order; each is folded before the next is asked for.
+        cache: of the map's cells.
+        snapshot: the same state, to read it at once; without one each read has a snapshot of its own, so that a long
+            plan holds none.
+        named: what this snapshot says of some commits, so that the store is not asked for each.
+    """
+    plan = _Plan(store, row, cache, head, snapshot, {each.id: each.is_retracted for each in named})
     for commit in commits:
         plan.take(commit)
     return Fold(
@@ -179,6 +202,9 @@ class _Plan:
     map: MapRow
     cache: CellCache
     start: Cursor
+    snapshot: Snapshot | None
+    known: dict[CommitId, bool]
+    """True for a commit that was retracted at the start."""
     chain: bytes = b""
     entries: list[Entry] = field(default_factory=list)
     folded: dict[CommitId, StoredCommit] = field(default_factory=dict)
@@ -197,8 +223,9 @@ class _Plan:
             return
         if not commit.retracts:
             return
-        with self.store.snapshot(self.map) as snapshot:
+        with self._reading() as snapshot:
             part = part_of(commit, snapshot)
+        self.known |= {each.id: each.is_retracted for each in part.named}
         due_from = part.due_from
         for place, target in enumerate((each.id for each in part.named), start=commit.due_from or 0):
             # Once for ever: a second retract of the same target, in this group or in the store, changes nothing.
@@ -243,7 +270,9 @@ class _Plan:
         self.retracted[target] = None
 
     def _is_retracted(self, commit: CommitId) -> bool:
-        return commit in self.retracted or self.store.is_retracted(self.map, commit)
+        if commit not in self.known:
+            self.known[commit] = self.store.is_retracted(self.map, commit)
+        return commit in self.retracted or self.known[commit]
 
     def _enter(self, kind: bytes, commit: StoredCommit) -> None:
         # All of the commit's cells or none: a damaged one raises before there is an entry.
@@ -286,16 +315,20 @@ class _Plan:
         except BadInputError as exc:
             raise DamagedCommitError("damaged_store", f"commit {commit.id} at rest: {exc.message}") from exc
 
-    # As `StoredCells`, each with a snapshot of its own: if another folding wrote since `start`, `store.fold` refuses.
+    def _reading(self) -> AbstractContextManager[Snapshot]:
+        """The state at the start, or a later one: if another folding wrote since then, `store.fold` refuses."""
+        return nullcontext(self.snapshot) if self.snapshot is not None else self.store.snapshot(self.map)
+
+    # As `StoredCells`.
 
     def row(self, key: CellKey) -> CellRow | None:
         """Row of a cell."""
-        with self.store.snapshot(self.map) as snapshot:
+        with self._reading() as snapshot:
             return row_of_cell(snapshot, key)
 
     def opened(self, key: CellKey, row: CellRow | None) -> tuple[BrickCell, CellStamps]:
         """Cell of a row, to be changed."""
-        with self.store.snapshot(self.map) as snapshot:
+        with self._reading() as snapshot:
             return cell_to_change(snapshot, key, row, self.map.geometry)
 
 

@@ -22,8 +22,9 @@ from cairn_server.folding.commit_work import part_of
 from cairn_server.folding.fold_lanes import FoldLanes
 from cairn_server.folding.fold_memory import FoldMemory
 from cairn_server.folding.fold_turns import FoldTurns
-from cairn_server.folding.folding import GROUP_BYTES_MAX, Damage, FoldStore, Order, fold_commits
+from cairn_server.folding.folding import GROUP_BYTES_MAX, Damage, FoldStore, Order, as_they_came, fold_commits
 from cairn_server.store.objects.cold_bytes import AwayError
+from cairn_server.store.store import Snapshot
 from cairn_server.store.store_rows import MapRow, StoredCommit
 
 log = logging.getLogger(__name__)
@@ -159,7 +160,7 @@ def fold_around(
     damaged: Damage,
     *,
     limit: int,
-    order: Order = iter,
+    order: Order = as_they_came,
 ) -> int:
     """Fold up to `limit` pending commits that touch no damaged cell; returns their count.
 
@@ -271,8 +272,8 @@ class LocalFolding:
         count, left = self._lanes.write_plan(row, cache, turns)
         waiting.leave(left, [commit.number for commit in left])
 
-        def order(commits: Sequence[StoredCommit]) -> Iterator[StoredCommit]:
-            return turns.in_turn(self._lanes.cheap(row, commits, cache))
+        def order(commits: Sequence[StoredCommit], snapshot: Snapshot) -> Iterator[StoredCommit]:
+            return turns.in_turn(self._lanes.cheap(row, commits, cache, snapshot))
 
         count += fold_around(self._store, row, cache, waiting, self._damaged, limit=GROUP_MAX, order=order)
         turns.end_group(time.monotonic() - start_s)

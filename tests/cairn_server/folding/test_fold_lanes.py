@@ -24,7 +24,7 @@ from cairn_map.evidence.grid import CellKey, cell_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.folding import commit_work, fold_lanes, folding, group_folding
 from cairn_server.folding.cell_cache import CellCache
-from cairn_server.folding.commit_work import SLICE_S, commit_work_s
+from cairn_server.folding.commit_work import SLICE_S, commit_work_s, decoding_of
 from cairn_server.folding.fold_turns import FoldTurns
 from cairn_server.folding.folding import fold_commits
 from cairn_server.store.sqlite.store import SqliteStore
@@ -59,7 +59,8 @@ def test_dust_air_and_very_many_cells_are_known_to_be_costly_before_they_are_dec
     with store.snapshot(row) as snapshot:
         works_s = [
             commit_work_s(
-                StoredCommit(number=n, id=CommitId(MOLE, n), sha=b"", text=b"", retracts=(), diff=diff), snapshot, ()
+                StoredCommit(number=n, id=CommitId(MOLE, n), sha=b"", text=b"", retracts=(), diff=diff),
+                decoding_of(snapshot, ()),
             )
             for n, diff in enumerate(diffs)
         ]

@@ -8,6 +8,7 @@ from tests.fixtures.server.pushes import pushed
 
 from cairn_server.folding import fold_thread, group_folding
 from cairn_server.folding.fold_thread import REST_MAX_S, REST_SHARE, rest_s
+from cairn_server.store.store_rows import MapRow
 
 
 def test_a_fold_is_followed_by_a_rest_only_if_commits_came_meanwhile() -> None:
@@ -41,3 +42,28 @@ def test_what_comes_while_the_folder_rests_is_folded_together(live: Live, monkey
     assert all_there.wait(20)
     until(lambda: sum(groups) == 5, "all folded")
     assert groups == [1, 4]
+
+
+def test_a_map_that_rests_does_not_hold_up_the_others(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
+    busy, other = live.new_map(), live.new_map()
+    monkeypatch.setattr(fold_thread, "rest_s", lambda _, *, is_pushed: 3600.0 if is_pushed else 0.0)
+    fold_group = fold_thread.FoldThread._fold_group
+
+    def slow(thread: fold_thread.FoldThread, row: MapRow, *, is_news: bool) -> group_folding.Folded:
+        folded = fold_group(thread, row, is_news=is_news)
+        if row.name == busy.name:
+            thread.wake()  # as by a push that comes meanwhile
+        return folded
+
+    monkeypatch.setattr(fold_thread.FoldThread, "_fold_group", slow)
+    live.push(busy, pushed(0, 0))
+    until(lambda: _seq(live, busy) == 1, "the first commit is folded")
+    live.push(busy, pushed(1, 1))
+    live.push(other, pushed(0, 0))
+    until(lambda: _seq(live, other) == 1, "the other map's commit is folded")
+    assert _seq(live, busy) == 1
+
+
+def _seq(live: Live, row: MapRow) -> int:
+    with live.service.store.snapshot(row) as snapshot:
+        return snapshot.head.seq
