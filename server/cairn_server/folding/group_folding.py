@@ -176,8 +176,8 @@ def fold_around(
     waiting.probe(store, row, damaged)
     held_pages, tried = 0, set[int]()
 
-    def noted(chosen: Sequence[StoredCommit]) -> Iterator[StoredCommit]:
-        for commit in order(chosen):
+    def noted(chosen: Sequence[StoredCommit], snapshot: Snapshot) -> Iterator[StoredCommit]:
+        for commit in order(chosen, snapshot):
             tried.add(commit.number)
             yield commit
 
