@@ -129,6 +129,7 @@ def fold_commits(
         return GroupOutcome()
     written = False
     try:
+        # One state for the whole plan: a store behind a network is asked once for all of a group's commits.
         with store.snapshot(row) as snapshot:
             named = snapshot.named([commit.id for commit in commits])
             # Another folding may have taken some of them since `pending`, and its head is our base; of a retract under
@@ -223,6 +224,7 @@ class _Plan:
             return
         if not commit.retracts:
             return
+        # What it names in this part, of which the state at the start is known from here on.
         with self._reading() as snapshot:
             part = part_of(commit, snapshot)
         self.known |= {each.id: each.is_retracted for each in part.named}
