@@ -68,7 +68,7 @@ def saddle_grid(points: SaddlePoints, board: Board) -> Floats | NoGrid:
     if len(points.pixels) < SEEN_SHARE_MIN * board.count:
         return NoGrid(f"{len(points.pixels)} places look like a corner, the board has {board.count}")
     best: Lattice = {}
-    neighbours = _neighbours(points)
+    neighbours = neighbours_of(points)
     unseen = set(range(len(points.pixels)))
     lattices = 0
     # Saddles are strongest first, so each round starts from the strongest that is in no lattice yet.
@@ -99,7 +99,7 @@ def saddle_grid(points: SaddlePoints, board: Board) -> Floats | NoGrid:
     )
 
 
-def _neighbours(points: SaddlePoints) -> npt.NDArray[np.intp]:
+def neighbours_of(points: SaddlePoints, *, step_ratio_max: float = STEP_RATIO_MAX) -> npt.NDArray[np.intp]:
     """(N, 2, 2) index of the next saddle along each edge, forwards and backwards; -1 for none."""
     count = len(points.pixels)
     # Distances to the nearest saddles: (N, K).
@@ -130,17 +130,17 @@ def _neighbours(points: SaddlePoints) -> npt.NDArray[np.intp]:
             nearest = distance.argmin(axis=1)
             own[:, edge, way] = distance[every, nearest]
             found[:, edge, way] = np.where(np.isfinite(own[:, edge, way]), near[every, nearest], -1)
-    found = _drop_long_steps(found, own)
+    found = _drop_long_steps(found, own, step_ratio_max)
     # Keep what is mutual: each is a neighbour of its neighbour.
     back = (found[found] == every[:, None, None, None, None]).any(axis=(3, 4))
     return np.where((found >= 0) & back, found, -1)
 
 
-def _drop_long_steps(found: npt.NDArray[np.intp], own: Floats) -> npt.NDArray[np.intp]:
+def _drop_long_steps(found: npt.NDArray[np.intp], own: Floats, step_ratio_max: float) -> npt.NDArray[np.intp]:
     """Neighbours, except those whose distance (`own`, pixels) is much larger than either end's shortest."""
     # Of both ends the shorter one: a step past a corner is long at either end.
     nearest = own.min(axis=(1, 2))
-    limit = STEP_RATIO_MAX * np.minimum(nearest[:, None, None], nearest[np.maximum(found, 0)])
+    limit = step_ratio_max * np.minimum(nearest[:, None, None], nearest[np.maximum(found, 0)])
     return np.where(own <= limit, found, -1)
 
 

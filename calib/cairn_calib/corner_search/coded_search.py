@@ -22,7 +22,8 @@ from cairn_calib.board.corners import FOUND, Attempt, Corners, Detection
 from cairn_calib.board.grid_fit import CELL_PX, fit_sharpest, reduce_image
 from cairn_calib.board.homography import fit_homography, map_points, steps_between
 from cairn_calib.board.polarity import PolarityCandidates
-from cairn_calib.corner_search.tag_detection import OTHERS_MIN, Bytes, board_tags, detect_tags, other_tags
+from cairn_calib.corner_search.saddle_tags import tags_of_saddles
+from cairn_calib.corner_search.tag_detection import OTHERS_MIN, BoardTags, Bytes, board_tags, detect_tags, other_tags
 from cairn_calib.corner_search.tag_layout import free_reach, layouts_of
 from cairn_map.arrays import Flags, Floats
 
@@ -69,13 +70,12 @@ def coded_candidates(
         return _candidates(_point(counts, board, pointed), "by hand", 1.0, [], None)
     ways: tuple[Polarity, ...] = ("normal", "reversed") if polarity == "vote" else (polarity,)
     attempts: list[Attempt] = []
-    even = _eight_bits(normalise_contrast(counts))
+    level = normalise_contrast(counts)
+    even = _eight_bits(level)
     scales = next(scales for longest, scales in SCALES if max(counts.shape) <= longest)
     # The first polarity and scale at which tags lie as on the board, and corners lie about them.
     for scale in scales:
-        sized = cv2.resize(
-            even, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
-        )
+        sized = np.clip(np.rint(_resize(even.astype(np.float32), scale)), 0, 255).astype(np.uint8)
         for way in ways:
             image = np.asarray(sized if way == "normal" else 255 - sized, np.uint8)
             seen = detect_tags(image, board.dictionary or "", layouts_of(board)[0].border_bits)
@@ -86,17 +86,35 @@ def coded_candidates(
                     # So many tags are no chance: another scale would say the same.
                     return _nothing(attempts)
                 continue
-            places = np.concatenate([tags.layout.corners(int(tag)) for tag in tags.tags.ids])
-            found = _grow(counts, board, places, (tags.tags.corners.reshape(-1, 2) + 0.5) / scale - 0.5)
-            candidates = _candidates(found, "tags", scale, attempts, way)
+            candidates = _candidates(_grow_from(counts, board, tags, scale), "tags", scale, attempts, way)
             if candidates.normal.corners is not None:
                 return candidates
             attempts = list(candidates.normal.attempts)
+    # Tags that are too small or too blurred for a detector of squares.
+    for scale in scales:
+        contrast = _resize(level, scale)
+        for way in ways:
+            tags = board_tags(tags_of_saddles(contrast, board, is_reversed=way == "reversed"), board)
+            if not isinstance(tags, str):
+                candidates = _candidates(_grow_from(counts, board, tags, scale), "saddles", scale, attempts, way)
+                if candidates.normal.corners is not None:
+                    return candidates
     if all(attempt.stage == "candidates" for attempt in attempts):
         named = other_tags([even, np.asarray(255 - even, np.uint8)], board)
         if named is not None:
             attempts.append(Attempt("other tags", 1.0, "tags", named))
     return _nothing(attempts)
+
+
+def _resize(image: Image, scale: float) -> Image:
+    # Reduced by areas, so that no pixel is skipped.
+    way = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
+    return np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=way), np.float32)
+
+
+def _grow_from(counts: Image, board: Board, tags: BoardTags, scale: float) -> Corners | str:
+    places = np.concatenate([tags.layout.corners(int(tag)) for tag in tags.tags.ids])
+    return _grow(counts, board, places, (tags.tags.corners.reshape(-1, 2) + 0.5) / scale - 0.5)
 
 
 def _nothing(attempts: list[Attempt]) -> PolarityCandidates:

@@ -97,7 +97,7 @@ def match_codes(cells: Floats, codes: Floats) -> tuple[Indices, Indices, Floats]
     """
     turned = np.stack([np.rot90(codes, k, axes=(1, 2)) for k in range(4)])
     templates = _normalise(turned.reshape(4 * len(codes), -1))
-    scores = _normalise(cells.reshape(len(cells), -1)) @ templates.T
+    scores = _normalise(cells.reshape(len(cells), codes[0].size)) @ templates.T
     best = scores.argmax(axis=1) if len(cells) else np.zeros(0, np.intp)
     return best % len(codes), best // len(codes), scores[np.arange(len(cells)), best]
 

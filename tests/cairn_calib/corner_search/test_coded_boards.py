@@ -196,6 +196,16 @@ def test_a_lens_that_bends_the_sheet_hides_little_of_it() -> None:
         assert np.nanmax(np.abs(corners.pixels - at)) < 0.15
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SHEETS)
+def test_tags_of_a_dozen_pixels_are_read_where_opencv_reads_none(name: str) -> None:
+    board = SHEETS[name][1]
+    for shot in shots(name, TOF, {"aprilgrid": (0.5, 0.55), "charuco": (0.42, 0.46)}[name], 3, seed=5):
+        corners = found(shot.image, board)
+        assert corners.seen.sum() > 0.75 * shot.in_view.sum()
+        assert np.nanmax(np.abs(corners.pixels - shot.at)) < 0.4
+
+
 def shot_of(sheet: Sheet) -> Image:
     rng = np.random.default_rng(4)
     return sheet_picture(COLOUR, sheet_pose(rng, COLOUR, sheet, range_m=(0.9, 0.9)), sheet, rng)
