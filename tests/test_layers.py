@@ -28,7 +28,6 @@ MAY_IMPORT = {
 
 MAY_NAME = {
     "cv2": [
-        "cairn_calib/board/circle_grid.py",
         "cairn_calib/board/corner_detection.py",
         "cairn_calib/board/corner_pictures.py",
         "cairn_calib/rig/image_files.py",
@@ -43,6 +42,7 @@ MAY_NAME = {
         "cairn_calib/corner_search/tag_detection.py",
         "cairn_calib/corner_search/image_search.py",
         "cairn_calib/corner_search/search_workers.py",
+        "cairn_calib/board/discs/blobs.py",
         "cairn_calib/verify/target_pictures.py",
         "cairn_fusion/image_fusion/cross_view.py",
         "cairn_fusion/image_fusion/mirror_labels.py",
@@ -107,7 +107,7 @@ ROOMS = {
         kernels evidence codec.octree codec.entropy codec commits wire files queries render
         warm_up
     """,
-    "cairn_calib": "rig board exchange corner_search solve diagnosis report thermal verify cli",
+    "cairn_calib": "rig board board.discs exchange corner_search solve diagnosis report thermal verify cli",
     "cairn_fusion": "recording clouds ros transfer mapping image_fusion view importers warm_up",
     "cairn_client": "replica sync http relay robot folders cli cli.maps cli.robots main",
     "cairn_sim": "scene render robots evaluation experiment study demo sim_command warm_up",

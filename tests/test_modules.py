@@ -26,7 +26,6 @@ CODE_MIN = 20
 TO_BE_REWRITTEN = ("cairn_map/codec/", "cairn_fusion/mapping/", "cairn_fusion/transfer/")
 """Kernels that get their comments with their rewrite for bricks."""
 PIPELINES = (
-    "cairn_calib/board/circle_grid.py",
     "cairn_calib/board/corner_detection.py",
     "cairn_calib/board/corner_gates.py",
     "cairn_calib/board/corner_refinement.py",
@@ -34,6 +33,9 @@ PIPELINES = (
     "cairn_calib/board/saddle_grid.py",
     "cairn_calib/board/saddle_points.py",
     "cairn_calib/diagnosis/next_image.py",
+    "cairn_calib/board/discs/disc_grid.py",
+    "cairn_calib/board/discs/disc_lattice.py",
+    "cairn_calib/board/discs/disc_outline.py",
     "cairn_calib/rig/brown.py",
     "cairn_calib/rig/projection_uncertainty.py",
     "cairn_calib/solve/adjustment.py",

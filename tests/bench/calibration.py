@@ -10,11 +10,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 from tests.bench.timing import cpu_s, wall_s
-from tests.fixtures.calib.board_images import BOARD, COLOUR, THERMAL, TOF, picture, pose
+from tests.fixtures.calib.board_images import BOARD, COLOUR, DISCS, THERMAL, TOF, picture, pose
 from tests.fixtures.calib.mrcal_reference import mrcal_solved, reference_problem
 from tests.fixtures.calib.simulated_views import SPECTRA, ranges_of, views_of, world
 
 from cairn_calib.board.corner_detection import find_chessboard
+from cairn_calib.board.discs.disc_grid import disc_candidates
 from cairn_calib.diagnosis.examination import examine
 from cairn_calib.solve.pixel_pattern import pixel_pattern
 from cairn_calib.solve.solve import solve_from, solve_rig
@@ -105,6 +106,14 @@ def _corner_rows(repeats: int) -> Iterator[Row]:
         f"{wall_s(find, repeats):.2f}",
         f"s wall, {cpu_s(find, repeats):.2f} s of CPU",
     )
+    heated = picture(THERMAL, pose(rng, THERMAL, board=DISCS), rng, board=DISCS)
+    counts = heated.astype(np.float32)
+
+    def find_discs() -> object:
+        return disc_candidates(counts, DISCS, polarity="vote", upright=False, pointed=None)
+
+    cpu, wall = cpu_s(find_discs, repeats), wall_s(find_discs, repeats)
+    yield "discs: one thermal image, polarity unknown", f"{cpu:.2f}", f"s of processor time, {wall:.2f} s wall"
     with tempfile.TemporaryDirectory() as name:
         paths = [Path(name) / f"{n}.png" for n in range(len(images))]
         for path, (image, _) in zip(paths, images, strict=True):

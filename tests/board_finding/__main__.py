@@ -18,6 +18,7 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
+from tests.board_finding.disc_trials import disc_trial, false_grids
 from tests.board_finding.empty_images import KINDS, empty_image
 from tests.board_finding.real_boards import changed, found_as_recorded, found_by_opencv, near, recorded, voted
 from tests.board_finding.trials import SPECTRA, Trial, found_rightly, trial
@@ -26,6 +27,8 @@ from tests.fixtures.calib.board_images import BOARD
 from cairn_calib.board.corner_detection import find_chessboard
 
 FOUND_MIN = 0.99
+LENSES_MIN = 0.9
+"""Of boards through lenses of up to 150 degrees, leaning by up to 50, next to clutter."""
 EMPTY = np.zeros((0, 0), np.uint8)
 TABLE = (("cells", "cell_px", (4, 6, 10, 40, 400)), ("tilt", "tilt_deg", (0, 15, 30, 45.1)))
 
@@ -44,6 +47,7 @@ def main() -> int:
     seed = args.seed
     good = [_boards(name, "chessboard", range(seed, seed + args.boards)) for name in SPECTRA]
     good += [_boards(name, "discs", range(seed, seed + args.discs)) for name in SPECTRA]
+    good += [_lenses(range(seed, seed + args.discs))]
     good += [_real_boards(range(seed, seed + args.real)), _false_grids(range(seed, seed + args.empty))]
     return 0 if all(good) else 1
 
@@ -69,6 +73,20 @@ def _boards(name: str, target: str, seeds: range) -> bool:
     if found:
         _say(f"{name:8} {target} all: found {_share(found)} of {len(found)}, at least {FOUND_MIN:.0%}")
     return sum(found) >= FOUND_MIN * len(found)
+
+
+def _lenses(seeds: range) -> bool:
+    """Grids of discs through lenses of 40 to 150 degrees."""
+    trials = [disc_trial(seed) for seed in seeds]
+    for each in trials:
+        if not each.is_found:
+            _say(f"    discs, {each}")
+    found = [each.is_found for each in trials]
+    sigmas = np.concatenate([each.sigmas for each in trials]) if trials else np.zeros(1)
+    far = float((sigmas > 3).mean())
+    if found:
+        _say(f"discs, lenses of 40 to 150 degrees: found {_share(found)} of {len(found)}, {far:.2%} beyond 3 sigma")
+    return sum(found) >= LENSES_MIN * len(found) and far < 0.01 and not any(each.is_wrong for each in trials)
 
 
 def _real_boards(seeds: range) -> bool:
@@ -100,6 +118,9 @@ def _false_grids(seeds: range) -> bool:
         if detection.corners is not None:
             false += 1
             _say(f"    false grid, seed {seed} ({kind}): {detection.attempts[-1]}")
+        if false_grids(image, seed):
+            false += 1
+            _say(f"    false grid of discs, seed {seed} ({kind})")
     _say(f"images without a board, of {len(set(KINDS))} kinds: {false} false grids of {len(seeds)}")
     return not false
 

@@ -18,8 +18,8 @@ from tests.fixtures.calib.board_images import (
 )
 
 from cairn_calib.board.board import Board, Polarity
-from cairn_calib.board.circle_grid import find_circles
 from cairn_calib.board.corner_detection import find_chessboard
+from cairn_calib.board.discs.disc_grid import find_circles
 from cairn_calib.solve.corner_residuals import disc_shift
 
 SPECTRA = {"tof": TOF, "thermal": THERMAL, "colour": COLOUR}

@@ -65,6 +65,8 @@ class CornerFile(BaseModel):
     """Polarity that the image itself tells, if any, or that was stated; `polarity` is that of all images together."""
     upright: bool = False
     """True if the first point is named by the rows of the image, not by the board's colours."""
+    disc_pitches: Annotated[float, Field(gt=0, le=2)] | None = None
+    """Diameter of the discs as this image shows it, pitches."""
     corners: Annotated[tuple[CornerEntry, ...], Field(max_length=64 * 64)]
     attempts: tuple[AttemptEntry, ...]
 
@@ -125,6 +127,7 @@ def corner_file(
         polarity=polarity,
         vote=vote,
         upright=upright,
+        disc_pitches=None if detection.disc_pitches is None else round(detection.disc_pitches, SIGNIFICANT),
         corners=tuple(entries),
         attempts=tuple(_attempt_entry(attempt) for attempt in detection.attempts),
     )

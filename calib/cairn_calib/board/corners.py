@@ -47,3 +47,5 @@ class Detection:
 
     corners: Corners | None
     attempts: tuple[Attempt, ...]
+    disc_pitches: float | None = None
+    """Diameter of the board's discs as the image shows it, pitches."""

@@ -20,7 +20,6 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_calib.board.board import Board, Polarity
-from cairn_calib.board.circle_grid import find_circles
 from cairn_calib.board.corner_detection import find_chessboard, fit_pointed_at
 from cairn_calib.board.corners import Corners, Detection
 from cairn_calib.board.homography import fit_homography, map_points
@@ -175,16 +174,3 @@ def chessboard_candidates(
         return PolarityCandidates(found, found, None)
     other = found if upright else Detection(reverse_corners(found.corners), found.attempts)
     return PolarityCandidates(found, other, margin_polarity(counts, found.corners) if polarity == "vote" else polarity)
-
-
-def disc_candidates(
-    counts: Grey, board: Board, *, polarity: Polarity | Literal["vote"], upright: bool, pointed: Floats | None
-) -> PolarityCandidates:
-    """A grid of discs in an image; arguments and errors are those of `find_circles`.
-
-    With the wrong polarity no disc is found, so the image votes for the only polarity with a detection.
-    """
-    tried: list[Polarity] = ["normal", "reversed"] if polarity == "vote" else [polarity]
-    found = [find_circles(counts, board, polarity=each, upright=upright, pointed=pointed) for each in tried]
-    seen: list[Polarity] = [way for way, each in zip(tried, found, strict=True) if each.corners is not None]
-    return PolarityCandidates(found[0], found[-1], seen[0] if len(seen) == 1 else None)

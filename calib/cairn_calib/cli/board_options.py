@@ -45,10 +45,6 @@ def board_by_options(args: argparse.Namespace) -> Board:
     """
     if not 0 < args.square <= 100:
         raise BadInputError("bad_board", f"--square is an edge in metres, above 0 and at most 100, got {args.square}")
-    if "circles" in args.pattern and args.disc is None:
-        raise BadInputError(
-            "bad_board", f"a board of {args.pattern} needs --disc, the diameter of its discs in metres: --disc 0.03"
-        )
     if "circles" not in args.pattern and args.disc is not None:
         raise BadInputError(
             "bad_board", f"--disc is of discs, and a {args.pattern} has none: leave it out, or say --pattern circles"

@@ -33,7 +33,8 @@ first row, end of last row, start of last row, and pass the file as `--outer-cor
      "images": {"left02.png": [[412, 96], [688, 130], [655, 310], [401, 288]]}}
 
 For grids of discs say `--pattern circles` or `asymmetric-circles`; `--square` is then from disc to disc, and `--disc`
-their diameter: the centroid of a tilted disc's image is not its centre's, which `cairn calib solve` must know.
+their diameter: the centroid of a tilted disc's image is not its centre's, which `cairn calib solve` must know. Without
+it the images show it, to about 1 %. Discs that the image's border cuts are left out.
 
 Boards with tags may be seen in part, and any way up: tags name the corners. Of OpenCV's ChArUco board `--board` counts
 squares, and `--marker` is the edge of a tag. Of Kalibr's AprilGrid it counts tags, `--square` is the edge of a tag from
@@ -53,6 +54,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+
 from cairn_calib.board.board import Polarity
 from cairn_calib.board.corner_file import read_outer_corners
 from cairn_calib.board.polarity import count_votes
@@ -71,6 +74,8 @@ from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError, CairnError, NotFoundError
 from cairn_map.progress import with_passing_progress
 
+DISC_RATIO = 1.07
+"""Ratio of the stated and the seen diameter of discs above which a warning is printed."""
 NAMED_MAX = 8
 """Images without a board that the last line names."""
 
@@ -149,6 +154,7 @@ def _run(args: argparse.Namespace) -> int:
     results = _search_and_write(tasks, args)
     polarity = _polarity(results, args)
     results = [_settle_and_write(task, each, polarity, args) for task, each in zip(tasks, results, strict=True)]
+    results = _settle_discs(tasks, results, args)
     lost = [each.document.image for each in results if not each.document.corners]
     found = len(args.images) - len(lost)
     more = f" and {len(lost) - NAMED_MAX} more" if len(lost) > NAMED_MAX else ""
@@ -203,6 +209,31 @@ def _settle_and_write(
     settled = settle(searched, task, polarity)
     if settled is not searched:
         write_outcome(args.output, task.path, settled)
+    return settled
+
+
+def _settle_discs(
+    tasks: Sequence[ImageTask], results: list[SearchedImage], args: argparse.Namespace
+) -> list[SearchedImage]:
+    """The outcomes with the discs' diameter, which the images show where it is not stated."""
+    shown = [each.document.disc_pitches for each in results if each.document.disc_pitches is not None]
+    if not shown:
+        return results
+    pitches, images = float(np.median(shown)), f"{len(shown)} image{'s' * (len(shown) != 1)}"
+    disc_m = float(f"{pitches * args.square:.3g}")
+    if args.disc is not None:
+        if not 1 / DISC_RATIO < disc_m / args.disc < DISC_RATIO:
+            _say(
+                f"warning: --disc says {args.disc:g} m, and in {images} discs are {disc_m:g} m across "
+                f"({pitches:.2f} of --square): measure both, for a wrong diameter biases the focal length"
+            )
+        return results
+    _say(f"discs are {disc_m:g} m across, as {images} show; --disc states it")
+    settled = []
+    for task, each in zip(tasks, results, strict=True):
+        board = each.document.board.model_copy(update={"disc_m": disc_m})
+        settled.append(replace(each, document=each.document.model_copy(update={"board": board})))
+        write_outcome(args.output, task.path, settled[-1])
     return settled
 
 

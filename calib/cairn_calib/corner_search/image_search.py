@@ -17,12 +17,8 @@ from cairn_calib.board.corner_detection import grey
 from cairn_calib.board.corner_file import CornerFile, corner_file, read_corner_file
 from cairn_calib.board.corner_pictures import encode_picture, overlay
 from cairn_calib.board.corners import Attempt, Detection
-from cairn_calib.board.polarity import (
-    PolarityCandidates,
-    chessboard_candidates,
-    disc_candidates,
-    reverse_corners,
-)
+from cairn_calib.board.discs.disc_grid import disc_candidates
+from cairn_calib.board.polarity import PolarityCandidates, chessboard_candidates, reverse_corners
 from cairn_calib.board.still_frames import StillImage, read_still, refuse_movement
 from cairn_calib.corner_search.coded_search import coded_candidates
 from cairn_map.arrays import Floats

@@ -202,7 +202,8 @@ def _of_noise(solution: Solution) -> Iterator[SolveWarning]:
             continue
         text = (
             f"corners miss by {noise_px:.2g} px, {sensor.scale:.1f} times as far as the noise of their images explains "
-            "(a lens model that does not fit, a bent board, motion): all standard deviations count that"
+            "(a detector that misplaced them, which its pictures show; a lens model that does not fit, a bent board, "
+            "motion): all standard deviations count that"
         )
         rank = Rank.CARE if noise_px > max(CARE_PX, CARE_WIDTH * width) else Rank.NOTE
         most = max(NOISE_MAX_PX, NOISE_MAX_WIDTH * width)

@@ -25,6 +25,8 @@ from cairn_calib.solve.solve_plan import SolvePlan
 from cairn_map.errors import BadInputError
 
 KIND = "bad_board_views"
+DISC_RATIO = 1.03
+"""Ratio of the diameters of one board's discs, as two cameras saw them, at most."""
 SEEN_MIN = 6
 """Points of a board in one image; with fewer its pose is hardly more than noise."""
 
@@ -150,7 +152,7 @@ def read_board_views(folders: Mapping[str, Path], *, frame: str | None = None) -
         used: dict[str, Path] = {}
         names = frames_of([path.stem for path, _ in documents], frame)
         for (path, document), name in zip(documents, names, strict=True):
-            boards.setdefault(document.board, path)
+            boards.setdefault(_without_small_difference(document.board, boards), path)
             # Images without a board are inputs, but no views.
             corners = document.to_corners()
             if corners is None or corners.seen.sum() < SEEN_MIN:
@@ -168,6 +170,16 @@ def read_board_views(folders: Mapping[str, Path], *, frame: str | None = None) -
         first, other = list(boards.values())[:2]
         raise BadInputError(KIND, f"{first} and {other} are of two boards: one calibration needs one board")
     return BoardViews(next(iter(boards)), sizes, tuple(views), inputs=tuple(inputs), polarities=polarities)
+
+
+def _without_small_difference(board: Board, others: Iterable[Board]) -> Board:
+    """The board, or an equal one among others whose discs' diameter, seen by another camera, differs a little."""
+    for other in others:
+        if board.disc_m and other.disc_m and 1 / DISC_RATIO < board.disc_m / other.disc_m < DISC_RATIO:
+            alike = board.model_copy(update={"disc_m": other.disc_m})
+            if alike == other:
+                return other
+    return board
 
 
 def _documents(folder: Path) -> list[tuple[Path, CornerFile]]:

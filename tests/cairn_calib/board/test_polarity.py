@@ -86,3 +86,16 @@ def test_bright_discs_are_found_without_being_told(tmp_path: Path, capsys: pytes
     assert main([str(tmp_path / "one.png"), *options, "--output", str(tmp_path / "out")]) == 0
     assert "polarity reversed: 0 for normal, 1 for reversed of 1 images" in capsys.readouterr().err
     assert read_corner_file(tmp_path / "out" / "one.json").polarity == "reversed"
+
+
+def test_the_diameter_of_discs_is_seen_where_it_is_not_stated(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rng = np.random.default_rng(11)
+    cv2.imwrite(str(tmp_path / "one.png"), picture(THERMAL, pose(rng, THERMAL, board=DISCS), rng, board=DISCS))
+    options = ["--board", "4x11", "--square", "0.05", "--pattern", "asymmetric-circles", "--polarity", "reversed"]
+    main([str(tmp_path / "one.png"), *options, "--output", str(tmp_path / "out")])
+    assert "as 1 image show" in capsys.readouterr().err
+    assert read_corner_file(tmp_path / "out" / "one.json").board.disc_m == pytest.approx(0.03, rel=0.04)
+    main([str(tmp_path / "one.png"), *options, "--disc", "0.04", "--output", str(tmp_path / "out")])
+    assert "warning: --disc says 0.04 m" in capsys.readouterr().err

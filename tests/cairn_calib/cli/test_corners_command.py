@@ -118,7 +118,6 @@ def test_images_are_never_overwritten_by_pictures_of_them(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--pattern", "circles"], "a board of circles needs --disc"),
         (["--disc", "0.03"], "--disc is of discs, and a chessboard has none"),
         (["--pattern", "circles", "--disc", "0.06"], "0.05 m apart, got 0.06 m"),
         (

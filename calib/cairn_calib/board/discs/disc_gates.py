@@ -1,0 +1,204 @@
+"""Gates that discs, and the grid that they make, must pass to count as the board's.
+
+A fit is one of the board's discs if it is alike the others in contrast and crispness, round and of one size on the
+board as the places of its neighbours show it, and where those around it predict it. A grid is the board if few discs
+in view are missing and the lattice does not go on beyond its rim.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from cairn_calib.board.board import Board
+from cairn_calib.board.corners import Corners
+from cairn_calib.board.discs.disc_lattice import NamedDiscs
+from cairn_calib.board.discs.disc_outline import HARMONIC_SIGMAS, DiscFit, Outline
+from cairn_calib.board.discs.local_map import local_map, predicted_by_others
+from cairn_map.arrays import Flags, Floats
+
+SEEN_MIN = 0.9
+"""Share of the discs wholly in view that must be seen."""
+DISCS_MIN = 6
+"""Discs without which a board has no pose."""
+CONTRAST_RATIO = 3.0
+"""Largest ratio between a disc's contrast and the usual one."""
+MISFIT_MAX, MISFIT_RATIO, MISFIT_SPARE = 0.35, 3.0, 0.05
+"""Root mean square residual of a disc's edge, share of its contrast; and against the grid's median: times and plus."""
+CLUTTER_RATIO, CLUTTER_WEIGHT = 1.08, 8.0
+"""Residual over the grid's median from which it shows clutter, and by how much its square counts in the covariance:
+discs 0.4 of a pitch from clutter 8 times as bright were off by up to 6 of the sigmas that noise alone makes."""
+RADIUS_RATIO = 1.25
+"""Largest ratio between a disc's size on the board and the usual one."""
+ROUND_RATIO = 1.35
+"""Largest ratio of the axes of a disc on the board, as the places of its neighbours show it."""
+MISS_STEPS, MISS_PX = 0.1, 1.0
+"""Largest distance of a disc from where those around it predict it, steps plus pixels."""
+CORNERED, CORNERED_SIGMAS = 0.04, 5.0
+"""Fourth harmonic along the lattice's axes that is no disc's, share of the radius: 0.11 for a square; and in sigmas."""
+BEYOND_SHARE = 0.5
+"""Share of the places along a side of the board at which discs of the same lattice make it part of a larger pattern."""
+DISC_PITCHES = (0.25, 1.0)
+"""Diameter of a disc, pitches (of asymmetric circles: distances of neighbours)."""
+
+
+@dataclass(frozen=True, slots=True)
+class GridFit:
+    """Fitted discs of a board, in its order."""
+
+    board: Board
+    fits: tuple[DiscFit | None, ...]
+    kept: Flags
+    """(N,) True for each disc that is one of the board's."""
+    in_view: Flags
+    """(N,) True for each disc that lies wholly in the image."""
+
+    @property
+    def pixels(self) -> Floats:
+        """(N, 2) centroids, NaN for discs that are not kept."""
+        found = np.array([[np.nan] * 2 if each is None else each.centroid for each in self.fits])
+        return np.where(self.kept[:, None], found, np.nan)
+
+    def corners(self) -> Corners:
+        """Centroids with covariance."""
+        covariance = np.array([np.full((2, 2), np.nan) if each is None else each.covariance_px2 for each in self.fits])
+        # Residuals beyond the grid's usual ones are no noise of single pixels, but clutter that reaches over the rim:
+        # that moves a whole side of an outline.
+        misfit = np.array([np.nan if each is None else each.misfit for each in self.fits])
+        ratio = misfit / (CLUTTER_RATIO * np.median(misfit[self.kept]))
+        covariance *= (1 + CLUTTER_WEIGHT * np.clip(ratio**2 - 1, 0, None))[:, None, None]
+        return Corners(self.board, self.pixels, np.where(self.kept[:, None, None], covariance, np.nan))
+
+
+def neighbour_step(board: Board) -> float:
+    """Distance of a board's neighbouring discs, pitches."""
+    return float(np.sqrt(2.0)) if board.pattern == "asymmetric-circles" else 1.0
+
+
+def sound_discs(board: Board, fits: Sequence[DiscFit | None]) -> Flags:
+    """(N,) True for each fit that is a disc of this board: alike in contrast, crispness, size, roundness and place."""
+    there = np.array([each is not None for each in fits])
+    if there.sum() < DISCS_MIN:
+        return np.zeros(len(fits), np.bool_)
+    contrast = np.array([np.nan if each is None else each.contrast for each in fits])
+    misfit = np.array([np.nan if each is None else each.misfit for each in fits])
+    with np.errstate(invalid="ignore"):
+        usual = np.nanmedian(contrast)
+        sound = there & (contrast > usual / CONTRAST_RATIO) & (contrast < usual * CONTRAST_RATIO)
+        sound &= misfit < min(MISFIT_MAX, MISFIT_RATIO * float(np.nanmedian(misfit)) + MISFIT_SPARE)
+    # Strays last, the worst first, since they spoil the predictions of those around them.
+    while sound.sum() >= DISCS_MIN:
+        off = _oddness(board, fits, sound)
+        worst = int(np.argmax(off))
+        if off[worst] <= 1:
+            break
+        sound[worst] = False
+    return np.asarray(sound)
+
+
+def _oddness(board: Board, fits: Sequence[DiscFit | None], sound: Flags) -> Floats:
+    """(N,) by how much each sound disc is too large, too long or out of place; 1 is the most that is allowed."""
+    lattice, step = board.lattice()[sound], neighbour_step(board)
+    kept = [each for each, right in zip(fits, sound, strict=True) if right and each is not None]
+    pixels = np.array([each.centroid for each in kept])
+    _, steps = local_map(lattice, pixels, lattice, step=step)
+    # The disc on the board: its image's ellipse in units of the steps there.
+    if np.linalg.det(steps).min() < 1e-3:
+        return np.where(sound, 9.0, 0.0)
+    own = np.linalg.inv(np.swapaxes(steps, 1, 2)) @ np.array([ellipse_of(each.outline) for each in kept])
+    axes = np.linalg.svd(own, compute_uv=False)
+    radius = np.sqrt(axes[:, 0] * axes[:, 1])
+    size = np.exp(np.abs(np.log(radius / np.median(radius))))
+    miss = np.linalg.norm(predicted_by_others(lattice, pixels, step=step) - pixels, axis=1)
+    length = np.sqrt(np.abs(np.linalg.det(steps))) * step
+    off = np.maximum(np.log(size) / np.log(RADIUS_RATIO), np.log(axes[:, 0] / axes[:, 1]) / np.log(ROUND_RATIO))
+    off = np.maximum(off, miss / (MISS_STEPS * length + MISS_PX))
+    low, high = DISC_PITCHES
+    off = np.where((2 * radius > low * step) & (2 * radius < high * step), off, 9.0)
+    result = np.zeros(len(sound))
+    result[sound] = off
+    return result
+
+
+def ellipse_of(outline: Outline) -> Floats:
+    """(2, 2) image of the unit circle with the fitted radius and second harmonic."""
+    a0, a2, b2 = outline.harmonics[:3]
+    return np.asarray(outline.shape @ ((1 + a0) * np.eye(2) + np.array([[a2, b2], [b2, -a2]])))
+
+
+def refusal(found: GridFit, named: NamedDiscs) -> tuple[str, str] | None:
+    """The gate that refuses a grid, and why; None where all let it pass."""
+    seen, in_view = int(found.kept.sum()), int(found.in_view.sum())
+    board = found.board
+    if seen < max(DISCS_MIN, SEEN_MIN * in_view):
+        return "discs", (
+            f"{seen} of the {in_view} discs in view have an outline like the others', at least {SEEN_MIN:.0%} must: "
+            "let nothing lie on the board, and let it be evenly warm or lit"
+        )
+    if seen < 0.5 * board.count:
+        return "discs", f"{seen} of {board.count} discs are wholly in view, at least half must be: move the board in"
+    corners_sigmas = _cornered(found)
+    if corners_sigmas is not None:
+        return "roundness", (
+            f"they have corners as squares have ({corners_sigmas:.0f} sigma): of a chessboard leave out --pattern"
+        )
+    if narrow := _open_sides(found):
+        return "rims", (
+            f"the {narrow} of the board are both cut by the image's border, so that it is open which discs these are: "
+            "show at least one end of its rows and one of its columns"
+        )
+    if named.beyond > BEYOND_SHARE * min(board.columns, board.rows):
+        return "rims", (
+            f"{named.beyond} more discs lie next to the board's rim in the same lattice: state the whole board with "
+            "--board, or cover what is not of it"
+        )
+    return None
+
+
+def _cornered(found: GridFit) -> float | None:
+    """Sigmas by which discs have four corners along or between the lattice's axes; None where they are round enough.
+
+    Where discs are small, each alone tells little of it, but all together do.
+    """
+    lattice, pixels = found.board.lattice()[found.kept], found.pixels[found.kept]
+    _, steps = local_map(lattice, pixels, lattice, step=neighbour_step(found.board))
+    towards = weight = 0.0
+    prior = HARMONIC_SIGMAS[-1] ** 2
+    for each, step in zip(
+        (f for f, kept in zip(found.fits, found.kept, strict=True) if kept and f), steps, strict=True
+    ):
+        # The fourth harmonic along the board's x axis, whose direction the outline's own frame shows.
+        x, y = np.linalg.solve(each.outline.shape, step[0])
+        angle = 4 * np.arctan2(y, x)
+        along = np.array([np.cos(angle), np.sin(angle)])
+        variance = float(along**2 @ each.fourth_variance)
+        towards += float(along @ each.outline.harmonics[5:7]) / variance
+        weight += max(1 / variance - 1 / prior, 0.0)
+    if weight == 0 or abs(towards) < CORNERED * weight:
+        return None
+    sigmas = abs(towards) / np.sqrt(weight)
+    return float(sigmas) if sigmas > CORNERED_SIGMAS else None
+
+
+def _open_sides(found: GridFit) -> str | None:
+    """Name of the two opposite sides that the image cuts; None where the board's place in the lattice is certain."""
+    board = found.board
+    cut = ~found.in_view.reshape(board.rows, board.columns)
+    if cut[0].any() and cut[-1].any():
+        return "first and last row"
+    if cut[:, 0].any() and cut[:, -1].any():
+        return "first and last column"
+    return None
+
+
+def disc_pitches(found: GridFit) -> float:
+    """Diameter of the board's discs in pitches, as its image shows: the median over its discs."""
+    lattice = found.board.lattice()[found.kept]
+    _, steps = local_map(lattice, found.pixels[found.kept], lattice, step=neighbour_step(found.board))
+    area = np.array([_area(each.outline) for each, kept in zip(found.fits, found.kept, strict=True) if kept and each])
+    return float(np.median(np.sqrt(4 * area / (np.pi * np.abs(np.linalg.det(steps))))))
+
+
+def _area(outline: Outline) -> float:
+    x, y = outline.rim().T
+    return 0.5 * abs(float(x @ np.roll(y, -1) - y @ np.roll(x, -1)))
