@@ -17,6 +17,7 @@ PAGES_WITH_COMMANDS = {
     "README.md",
     "administrator.md",
     "calibration-engineer.md",
+    "calibration-tour.md",
     "operator.md",
     "paper-experiment.md",
     "robot-developer.md",
