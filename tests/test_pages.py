@@ -16,6 +16,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from tests.fixtures.calib.foreign_rigs import ROS2_ECHO
 from tests.fixtures.calib.thermal_images import SIZE, black_bodies
 from tests.fixtures.client.live_server import wait_until
 from tests.fixtures.client.robots import robot_in
@@ -60,8 +61,21 @@ SHORTENED: dict[str, Command] = {
     "robot replay RECORDING --map http://127.0.0.1:8750/maps/shelf --share 2/2 --name right": NEAR,
 }
 """Options added to commands that would take minutes; argparse takes the last of an option that is given twice."""
+LISTS = "wants files of other programs: tests/cairn_calib/exchange/test_corner_lists.py"
+TAGS = "wants images of sheets with tags: tests/cairn_calib/corner_search"
 ELSEWHERE = {
     "calib study --output study": "takes minutes: tests/cairn_sim/study/test_study.py runs two configurations of ten",
+    "calib convert-corners corners.vnl corners/left --images *-cam0.jpg --board 10x10 --square 0.0588": LISTS,
+    "calib convert-corners left.mat corners/left --square 0.025": LISTS,
+    "calib convert-corners corners/left corners/right corners.vnl": LISTS,
+    "calib convert-corners thermal/seen.csv corners/thermal --points pins.csv --blobs 8": (
+        "wants images of pins: tests/cairn_calib/exchange/test_named_points.py"
+    ),
+    "calib corners shots/*.png --pattern aprilgrid --board 6x6 --square 0.088 --spacing 0.3 --output corners": TAGS,
+    "calib corners shots/*.png --pattern charuco --board 11x8 --square 0.03 --marker 0.022 --tags 5x5_100 "
+    "--output corners": TAGS,
+    "calib solve corners/depth corners/left --spectrum depth=range,left=colour --range depth --z-depth "
+    "--output rig.json": "wants depth images: tests/cairn_calib/solve/test_z_depth.py",
 }
 """Commands of the page for calibration engineers that are not run here: the reason, and the test that runs them."""
 CAMCHAIN = """cam0:
@@ -296,6 +310,7 @@ def test_commands_of_the_page_about_the_experiment_run(page: Page) -> None:
 def test_commands_of_the_page_for_calibration_engineers_run(page: Page) -> None:
     folder, chess = page.folder, Path(os.environ["CAIRN_TEST_DATA"]) / "opencv_stereo_chess"
     (folder / "camchain.yaml").write_text(CAMCHAIN)
+    (folder / "info.yaml").write_text(ROS2_ECHO)
     for name in ("shots", "left", "right"):
         (folder / name).mkdir()
     for number in (1, 2, 3, 4, 5, 6):
@@ -316,6 +331,16 @@ def test_commands_of_the_page_for_calibration_engineers_run(page: Page) -> None:
         options = ("--board", "9x6", "--square", "0.025", "--output", "corners/right")
         cairn(*page.here(["calib", "corners", "right/*.jpg", *options]), folder=folder)
 
+    def copy_rig(*names: str) -> None:
+        for name in names:
+            shutil.copy(folder / "rig.json", folder / name)
+
+    def write_lenses() -> None:
+        copy_rig("last-year.json", "rig-march.json", "rig-april.json")
+        for name, form in (("{camera}.yaml", "opencv"), ("{camera}.cameramodel", "mrcal")):
+            cairn("calib", "convert", "rig.json", name, "--format", form, "--drop", "calibration", folder=folder)
+        (folder / "left.yaml").rename(folder / "factory.yaml")
+
     def write_rig(rig: Rig) -> None:
         (folder / "rig.json").write_bytes(rig.to_json())
 
@@ -333,6 +358,7 @@ def test_commands_of_the_page_for_calibration_engineers_run(page: Page) -> None:
             "calib solve corners/left corners/right --spectrum colour --output rig.json --report report.html": (
                 find_corners_of_the_right
             ),
+            "calib report rig.json corners/left corners/right --output again.html": write_lenses,
             "calib verify rig.json drive-1 --output verified": lambda: write_rig(head),
             "calib thermal fit blackbody.csv calibrated.json --rig rig.json --camera thermal_left": (
                 lambda: write_rig(camera)
