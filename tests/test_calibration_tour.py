@@ -146,7 +146,7 @@ def test_commands_and_program_print_what_the_page_shows(tmp_path: Path) -> None:
 
 
 def _run(arguments: list[str]) -> str:
-    """What a command prints, on both streams."""
+    """Output of a command, both streams in one."""
     words = [name for word in arguments for name in (sorted(map(str, Path().glob(word))) or [word])]
     with redirect_stdout(StringIO()) as out, redirect_stderr(out):
         code = main(words)

@@ -122,7 +122,7 @@ def _number(link: psycopg.Connection, query: str) -> int:
 
 @dataclass(slots=True)
 class _Load:
-    """What was seen of robots on many maps."""
+    """Times of the pushes of robots on many maps, and of their folding."""
 
     pushes_s: list[float] = field(default_factory=list)
     lags_s: list[float] = field(default_factory=list)
@@ -166,7 +166,7 @@ def _crowd_rows(diffs: list[Diff], geometry: Geometry, maps: int, idle: int, sec
 
 
 def _cpu_s(members: Sequence[Server], postgres: PostgresServer) -> tuple[float, float, float]:
-    """Of those that serve, of the last one, which folds, and of the database."""
+    """Processor time so far, seconds: of the servers, of the last member, which folds, and of the database."""
     *serving, folding = members
     return sum(server.cpu_s() for server in serving), folding.cpu_s(), cpu_s_of(with_children(postgres.pid))
 

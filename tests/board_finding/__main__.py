@@ -28,7 +28,7 @@ from cairn_calib.board.corner_detection import find_chessboard
 
 FOUND_MIN = 0.99
 LENSES_MIN = 0.9
-"""Of boards through lenses of up to 150 degrees, leaning by up to 50, next to clutter."""
+"""Least share found of boards through lenses of up to 150 degrees, leaning by up to 50, next to clutter."""
 EMPTY = np.zeros((0, 0), np.uint8)
 TABLE = (("cells", "cell_px", (4, 6, 10, 40, 400)), ("tilt", "tilt_deg", (0, 15, 30, 45.1)))
 

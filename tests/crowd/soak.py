@@ -46,7 +46,7 @@ class Outcome:
     """Robots that stood at the head in the end."""
     exit_code: int
     complaints: str
-    """What the servers wrote to standard error."""
+    """Text that the servers wrote to standard error."""
 
 
 Progress = Callable[[float, Seen, list[Sample]], None]

@@ -50,7 +50,7 @@ class Watch:
 
 
 def sample_of(pids: Sequence[int]) -> Sample:
-    """What processes and their children hold and took now."""
+    """Memory and processor time of processes and their children now."""
     now_s = time.perf_counter()
     found = [_of_process(number) for pid in pids for number in (pid, *_children(pid))]
     return Sample(now_s, sum(resident for resident, _ in found), sum(cpu_s for _, cpu_s in found))

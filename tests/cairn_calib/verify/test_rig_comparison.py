@@ -16,9 +16,9 @@ from cairn_calib.verify.rig_comparison import PixelComparison, compare_rigs
 from cairn_map.errors import BadInputError
 
 SIGMAS = np.array([0.4, 0.4, 0.5, 0.5, 1e-3, 2e-3, 1e-4, 1e-4, 2e-3])
-"""Of fx fy cx cy k1 k2 p1 p2 k3."""
+"""Standard deviations of fx, fy, cx, cy (px), k1, k2, p1, p2, k3."""
 SHIFTS = np.array([2e-4, 2e-4, 3e-4, 5e-4, 5e-4, 1e-3])
-"""Of rx ry rz tx ty tz."""
+"""Standard deviations of a camera's place: rotation vector (rad) and translation (m)."""
 
 
 def covariances(seed: int = 0) -> tuple[list[tuple[str, str]], np.ndarray]:

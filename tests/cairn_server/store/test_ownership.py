@@ -101,7 +101,7 @@ def refusal_of(process: Ownership, clock: SteadyClock) -> str:
 
 
 def holds_after_a_wait(process: Ownership, clock: SteadyClock) -> bool:
-    """Whether a process may work once the object stood still."""
+    """True if a process may work only once the object stood still."""
     first = process.holds()
     clock.now_s += STILL_TURNS * TURN_S
     return not first and process.holds()
