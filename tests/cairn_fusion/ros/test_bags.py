@@ -212,7 +212,7 @@ def camera_changed(source: Recording, **changes: object) -> str:
         ({"topic": "/colour_left/image_raw"}, "unknown_encoding", "/colour_left/image_raw at 1760000000"),
         ({"info": "/tf"}, "no_messages", "give intrinsics instead of info"),
         ({"info": "/colour_left/camera_info"}, "image_size", "must be 128 x 96 pixels, got 176 x 144"),
-        ({"info": None}, "bad_mapping", "cameras.tof: Value error, give either info"),
+        ({"info": None}, "bad_mapping", "cameras.tof: give either info"),
         ({"T_base_camera": None, "frame": "elsewhere"}, "no_transform", "from elsewhere to base_link"),
         ({"spectrum": "colour"}, "bad_mapping", "amplitude is of range cameras"),
         ({"unit": 3}, "bad_mapping", "cameras.tof.unit"),
