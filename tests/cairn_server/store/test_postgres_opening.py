@@ -233,6 +233,26 @@ AFTER_NEXT = Step("DROP TABLE added", oldest=len(STEPS) + 1)
 """The step after it, which takes away what only the version before it needs."""
 
 
+def test_a_step_gives_way_to_a_reader_that_waits_for_it(
+    postgres_database: Database, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    PgStore(postgres_database.url).close()
+    monkeypatch.setattr(schema, "STEPS", (*STEPS, NEXT))
+    with connect(postgres_database.url) as reader, reader.transaction():
+        # The reader has the step's last table, the step the first one, for which the reader asks next.
+        reader.execute("SELECT count(*) FROM cell")
+        opened: list[PgStore] = []
+        step = threading.Thread(target=lambda: opened.append(PgStore(postgres_database.url)))
+        step.start()
+        waits = "SELECT count(*) FROM pg_locks WHERE NOT granted"
+        until(lambda: postgres_database.execute(waits)[0][0] > 0, "the step waits")
+        for _ in range(20):
+            assert reader.execute("SELECT count(*) FROM commits").fetchone() == (0,)
+        assert not opened
+    step.join()
+    opened[0].close()
+
+
 def test_a_server_goes_on_while_the_next_version_brings_its_step_and_works_beside_it(
     postgres_database: Database, monkeypatch: pytest.MonkeyPatch
 ) -> None:

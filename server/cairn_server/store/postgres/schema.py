@@ -29,6 +29,11 @@ SERVER_MIN = 150_000
 """Oldest PostgreSQL, as its `server_version_num`."""
 STARTS_MAX = 8
 """Most attempts of servers that start at once on an empty database: one makes the tables, the others wait for it."""
+LOCK_S = 0.3
+"""Longest wait of a step for a table that other servers use, seconds: less than the one second after which the database
+ends one of two transactions that wait for each other, so that the step gives way and never a robot's request."""
+LOCK_TRIES_MAX = 100
+"""Most attempts of a step: half a minute of a busy database."""
 
 IS_WAITING = "((folded_seq IS NULL AND damaged IS NULL) OR due_from IS NOT NULL)"
 """SQL of the commits that folding has still to do with."""
@@ -381,7 +386,7 @@ def prepare(url: str, *, has_objects: bool = False) -> None:
         raise BadInputError(
             "bad_store", f"a store works on the primary alone: leave target_session_attrs={wanted} out of {place}"
         )
-    for turn in range(STARTS_MAX):
+    for turn in range(LOCK_TRIES_MAX):
         try:
             with _connected(url) as connection, connection.transaction():
                 _check_server(connection, place)
@@ -389,9 +394,14 @@ def prepare(url: str, *, has_objects: bool = False) -> None:
                 if not has_objects:
                     _check_unbound(connection, place)
             return
+        except errors.LockNotAvailable as exc:
+            if turn == LOCK_TRIES_MAX - 1:
+                raise BadInputError(
+                    "bad_store", f"the tables of {place} are in use all the time; start again when it is less busy"
+                ) from exc
         except (errors.UniqueViolation, errors.DuplicateTable) as exc:
             # Two servers make the first table at the same time: one of them fails, and finds it then.
-            if turn == STARTS_MAX - 1 or isinstance(exc, errors.DuplicateTable):
+            if turn >= STARTS_MAX - 1 or isinstance(exc, errors.DuplicateTable):
                 raise opening_failure(exc, place) from exc
         except CairnError:
             raise
@@ -459,6 +469,7 @@ def _take_steps(connection: Connection) -> None:
         )
     if version >= len(STEPS):
         return
+    connection.execute(f"SET LOCAL lock_timeout TO '{LOCK_S}s'".encode())
     for step in STEPS[version:]:
         connection.execute(step.sql.encode())
     connection.execute("DELETE FROM cairn_schema")
