@@ -104,7 +104,7 @@ MAY_NAME = {
 ROOMS = {
     "cairn_map": """
         errors arrays progress machine_memory
-        kernels evidence codec.octree codec.entropy codec commits wire files queries render
+        kernels evidence epochs codec.octree codec.entropy codec commits wire files queries render
         warm_up
     """,
     "cairn_calib": "rig board board.discs exchange corner_search solve diagnosis report thermal verify cli",

@@ -129,11 +129,12 @@ def found() -> dict[str, object]:
     commit, _ = open_commit((FOLDER / "v1.commit").read_bytes())
     frames = frames_of((FOLDER / "v1.reply").read_bytes())
     payloads = [frame for frame in frames if isinstance(frame, CellFrame) and frame.payload]
+    meta = json.loads(commit.meta.model_dump_json(exclude={"layers", "epoch"}))  # fields of version 2 alone
     return {
         "geometry": GEOMETRY.digest().hex(),
         "digests": {name: cell.digest.hex() for name, cell in cells.items()},
         "fingerprints": {name: fingerprint(cell.evidence, cell.key).hex() for name, cell in cells.items()},
-        "commit": {"sha": commit.sha.hex(), "meta": json.loads(commit.meta.model_dump_json())},
+        "commit": {"sha": commit.sha.hex(), "meta": meta},
         "reply": [type(frame).__name__ + getattr(getattr(frame, "kind", None), "name", "") for frame in frames],
         "payloads": [decode_cell(frame.payload).digest.hex() for frame in payloads],
     }

@@ -12,13 +12,19 @@ from tests.naive.cell_code import decode_cell
 def commit_parts(data: bytes) -> tuple[bytes, list[bytes], bytes]:
     """Meta, cell files and SHA-256 of a sound commit."""
     file = io.BytesIO(data)
-    assert file.read(5) == b"CRCM\x01"
+    assert file.read(4) == b"CRCM"
+    version = file.read(1)[0]
+    assert version in (1, 2)
     (meta_bytes,) = struct.unpack("<I", file.read(4))
     meta = file.read(meta_bytes)
     (count,) = struct.unpack("<I", file.read(4))
-    cells = [file.read(*struct.unpack("<I", file.read(4))) for _ in range(count)]
+    cells = []
+    for _ in range(count):
+        if version == 2:
+            assert file.read(1) == b"\0", "there is one layer"
+        cells.append(file.read(*struct.unpack("<I", file.read(4))))
     assert not file.read()
-    sha = hashlib.sha256(b"cairn-commit-1" + struct.pack("<II", meta_bytes, count) + meta)
+    sha = hashlib.sha256(f"cairn-commit-{version}".encode() + struct.pack("<II", meta_bytes, count) + meta)
     for cell in cells:
         sha.update(decode_cell(cell)[0]["digest"])
     return meta, cells, sha.digest()

@@ -2,6 +2,9 @@
 
     "CRCM" | version u8 | meta length u32 | meta (JSON) | cell count u32 | per cell: length u32, cell bytes
 
+In version 2, of maps with epochs, the meta names the layers and the epoch, and each cell begins with a u8, the number
+of its layer. A cell of a commit has one row, that of the epoch, and so is a cell file of version 1 in both.
+
 Its SHA-256 is taken over the meta bytes and the cells' canonical digests, so that cells may be recompressed without
 changing it. A retract is a commit without cells that names others; an amend is one with both. FORMAT.md is the norm.
 """
@@ -20,12 +23,18 @@ from pydantic import BaseModel, ConfigDict, FailFast, Field, ValidationError, mo
 from cairn_map.codec.cell_code import Profile, decode_cell, encode_cells
 from cairn_map.codec.octree.cell_head import decode_head
 from cairn_map.commits.ids import CommitId, commit_id_from_text
+from cairn_map.epochs.epoch import BASE, EPOCH_MAX, Epoch
+from cairn_map.epochs.layer import Hex32, LayerIdentity, MapLayer
 from cairn_map.errors import BadInputError, DamagedDataError, first_error
 from cairn_map.evidence.evidence import Evidence, every_sum_has_weight
 from cairn_map.evidence.grid import CellKey, Geometry
 
 MAGIC = b"CRCM"
-VERSION = 1
+SUM_VERSION, EPOCH_VERSION = 1, 2
+"""Versions of a commit's bytes: of maps with one sum for all times, and of maps with epochs."""
+LAYERS_MAX = 1
+"""Layers of a commit that this reader knows; the format has room for 16."""
+CELL_PREFIX = {SUM_VERSION: struct.Struct("<I"), EPOCH_VERSION: struct.Struct("<BI")}
 HEAD = struct.Struct("<4sBI")
 META_BYTES_MAX = 1 << 20
 CELLS_MAX = 4096
@@ -48,7 +57,6 @@ SMALLER = "commit after fewer scans, with a smaller max_range_m, or on a map wit
 """Next step after `too_large`."""
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-Hex32 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
 class ScanPose(BaseModel):
@@ -69,8 +77,12 @@ class CommitMeta(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     id: Annotated[str, Field(max_length=96)]
-    geometry: Hex32
-    """Digest of the map's geometry; evidence for another grid is refused."""
+    geometry: Hex32 | None = None
+    """Digest of the map's geometry; evidence for another grid is refused. None in version 2, which has `layers`."""
+    layers: Annotated[tuple[LayerIdentity, ...], Field(max_length=16), FailFast()] = ()
+    """Layers of which it has cells; only in version 2."""
+    epoch: Annotated[int, Field(ge=-EPOCH_MAX, le=EPOCH_MAX)] | None = None
+    """Epoch of the evidence, from the time of the last scan; None: it has no time."""
     parent: Hex32 | None = None
     """SHA-256 of the author's previous commit."""
     seen: Annotated[str, Field(max_length=128)] | None = None
@@ -98,6 +110,29 @@ class CommitMeta(BaseModel):
         if own in named or len(set(named)) != len(named):
             raise ValueError("a commit names others to retract, each once")
         return self
+
+    @model_validator(mode="after")
+    def _one_version(self) -> Self:
+        if (self.geometry is None) != bool(self.layers) or (self.epoch is not None and not self.layers):
+            raise ValueError("a commit names either its geometry, or its layers and epoch")
+        if len(self.layers) > LAYERS_MAX:
+            raise ValueError(f"this reader knows commits of {LAYERS_MAX} layer, got {len(self.layers)}")
+        return self
+
+    @property
+    def version(self) -> int:
+        """Version of the commit's bytes."""
+        return EPOCH_VERSION if self.layers else SUM_VERSION
+
+    @property
+    def grid(self) -> str:
+        """Digest of the geometry of its cells, in hex."""
+        return self.layers[0].geometry if self.layers else self.geometry or ""
+
+    @property
+    def row(self) -> Epoch:
+        """Row of the cells' histories to which the evidence is added."""
+        return BASE if self.epoch is None else Epoch(self.epoch)
 
     @property
     def commit_id(self) -> CommitId:
@@ -137,14 +172,22 @@ class Commit:
 
 
 def make_commit(
-    meta: CommitMeta, diff: Mapping[CellKey, Evidence], geometry: Geometry, *, profile: Profile = Profile.FAST
+    meta: CommitMeta, diff: Mapping[CellKey, Evidence], grid: Geometry | MapLayer, *, profile: Profile = Profile.FAST
 ) -> Commit:
     """Commit of a measurement's evidence; cells without evidence are left out. Its SHA is the same in every profile.
+
+    Args:
+        meta: facts of the commit, whose digests are those of the grid.
+        diff: evidence by cell.
+        grid: the map's geometry; of a map with epochs, its layer.
+        profile: coding of the cells.
 
     Raises:
         BadInputError: negative evidence, sums without weight, too many cells, or larger than a reader would accept.
     """
-    if meta.geometry != geometry.digest().hex():
+    layer = grid if isinstance(grid, MapLayer) else MapLayer(geometry=grid)
+    geometry = layer.geometry
+    if meta.grid != geometry.digest().hex() or meta.layers != layer.identities:
         raise BadInputError("other_geometry", "the commit's meta names another geometry than its evidence has")
     # Only evidence that adds, and that has weights.
     held = {key: evidence for key, evidence in diff.items() if len(evidence)}
@@ -157,12 +200,12 @@ def make_commit(
     cells = {key: cell.data for key, cell in encoded.items()}
     digests = [cell.digest for cell in encoded.values()]
     text = meta.model_dump_json(exclude_defaults=True).encode()
-    data = commit_bytes(text, cells)
+    data = commit_bytes(text, cells, version=meta.version)
     # All limits of a reader, so that no server refuses the commit later.
     _check_size(len(data), len(cells), len(text))
     check_evidence_size(sum(evidence.size_bytes for evidence in diff.values()), evidence_limit_bytes(len(data)))
     check_bricks(sum(evidence.brick_count for evidence in diff.values()), size_bytes=len(data))
-    return Commit(meta, cells, commit_sha(text, digests), data)
+    return Commit(meta, cells, commit_sha(text, digests, version=meta.version), data)
 
 
 def sha_without_evidence(data: bytes) -> bytes | None:
@@ -172,8 +215,8 @@ def sha_without_evidence(data: bytes) -> bytes | None:
         DamagedDataError: cut off or contradictory.
         BadInputError: an unknown version, or larger than allowed.
     """
-    _, text, bodies = split_bytes(data)
-    return None if bodies else commit_sha(text, [])
+    meta, text, bodies = split_bytes(data)
+    return None if bodies else commit_sha(text, [], version=meta.version)
 
 
 def renamed_commit(
@@ -185,7 +228,9 @@ def renamed_commit(
     meta = meta.model_copy(update={"id": str(commit), "parent": parent, "retracts": targets})
     text = meta.model_dump_json(exclude_defaults=True).encode()
     digests = [decode_cell(body).digest for body in cells.values()]
-    return Commit(meta, cells, commit_sha(text, digests), commit_bytes(text, cells))
+    version = meta.version
+    sha, whole = commit_sha(text, digests, version=version), commit_bytes(text, cells, version=version)
+    return Commit(meta, cells, sha, whole)
 
 
 def split_commit(data: bytes) -> tuple[CommitMeta, dict[CellKey, bytes]]:
@@ -232,11 +277,12 @@ def check_evidence_size(evidence_bytes: int, limit_bytes: int) -> None:
         )
 
 
-def commit_bytes(text: bytes, cells: Mapping[CellKey, bytes]) -> bytes:
+def commit_bytes(text: bytes, cells: Mapping[CellKey, bytes], *, version: int = SUM_VERSION) -> bytes:
     """Bytes of a commit, from the bytes of its meta and of its cells, rising in number."""
-    parts = [HEAD.pack(MAGIC, VERSION, len(text)), text, struct.pack("<I", len(cells))]
+    parts = [HEAD.pack(MAGIC, version, len(text)), text, struct.pack("<I", len(cells))]
+    layer = (0,) if version == EPOCH_VERSION else ()
     for data in cells.values():
-        parts += [struct.pack("<I", len(data)), data]
+        parts += [CELL_PREFIX[version].pack(*layer, len(data)), data]
     return b"".join(parts)
 
 
@@ -264,8 +310,9 @@ def split_bytes(data: bytes) -> tuple[CommitMeta, bytes, list[bytes]]:
     if len(data) < HEAD.size or data[:4] != MAGIC:
         raise DamagedDataError("bad_commit", "not a cairn commit: it must begin with CRCM and a whole head")
     _, version, meta_bytes = HEAD.unpack_from(data)
-    if version != VERSION:
-        raise BadInputError("unknown_version", f"this reader knows commits of version {VERSION}, got {version}")
+    prefix = CELL_PREFIX.get(version)
+    if prefix is None:
+        raise BadInputError("unknown_version", f"this reader knows commits of version 1 and 2, got {version}")
     _check_size(len(data), 0, meta_bytes)
     # Meta.
     text = data[HEAD.size : HEAD.size + meta_bytes]
@@ -278,14 +325,20 @@ def split_bytes(data: bytes) -> tuple[CommitMeta, bytes, list[bytes]]:
         _UNIQUE.decode(text.decode())
     except ValidationError as exc:
         raise DamagedDataError("bad_commit", f"commit meta: {first_error(exc)}") from None
+    if meta.version != version:
+        raise DamagedDataError("bad_commit", f"a commit of version {version} has the meta of version {meta.version}")
     # Cells: a length that is cut off counts as too large, so that `at` passes the end.
     (count,) = struct.unpack_from("<I", data, at - 4)
     _check_size(len(data), count, meta_bytes)
     bodies: list[bytes] = []
     for _ in range(count):
-        (size,) = struct.unpack_from("<I", data, at) if at + 4 <= len(data) else (len(data),)
-        bodies.append(data[at + 4 : at + 4 + size])
-        at += 4 + size
+        # Layer 0 is the only one, so a prefix of version 2 is one zero and the length.
+        is_whole = at + prefix.size <= len(data)
+        *layer, size = prefix.unpack_from(data, at) if is_whole else (len(data),)
+        if any(layer):
+            raise DamagedDataError("bad_commit", "a cell is of a layer that the commit does not name")
+        bodies.append(data[at + prefix.size : at + prefix.size + size])
+        at += prefix.size + size
     if at != len(data):
         raise DamagedDataError("bad_commit", "the commit is cut off, or bytes are left over")
     return meta, text, bodies
@@ -309,9 +362,9 @@ def _check_size(size_bytes: int, cells: int, meta_bytes: int) -> None:
         )
 
 
-def commit_sha(text: bytes, digests: list[bytes]) -> bytes:
+def commit_sha(text: bytes, digests: list[bytes], *, version: int = SUM_VERSION) -> bytes:
     """Identity of a commit: SHA-256 over the bytes of its meta and its cells' digests."""
-    sha = hashlib.sha256(b"cairn-commit-1" + struct.pack("<II", len(text), len(digests)) + text)
+    sha = hashlib.sha256(b"cairn-commit-%d" % version + struct.pack("<II", len(text), len(digests)) + text)
     for digest in digests:
         sha.update(digest)
     return sha.digest()

@@ -53,7 +53,7 @@ class CommitReader:
 
     def commit(self, digests: list[bytes]) -> Commit:
         """The commit, of whose cells all were validated and have these digests."""
-        return Commit(self.meta, self.cells, commit_sha(self.text, digests), self.data)
+        return Commit(self.meta, self.cells, commit_sha(self.text, digests, version=self.meta.version), self.data)
 
     def canonical_cells(self, *, evidence_bytes_max: int = EVIDENCE_BYTES_MAX) -> Iterator[CanonicalCell]:
         """The cells, one after the other, each validated completely; the commit is sound once all of them came.
@@ -86,7 +86,7 @@ class CommitReader:
                 raise DamagedDataError("bad_commit", "cells must have evidence and rise in number")
             if head.signed:
                 raise negative_evidence()
-            if head.geometry is not geometry and head.geometry.digest().hex() != self.meta.geometry:
+            if head.geometry is not geometry and head.geometry.digest().hex() != self.meta.grid:
                 raise BadInputError("other_geometry", "a cell of the commit has another geometry than its meta names")
             last, geometry = head.key, head.geometry
         check_evidence_size(VOXEL_BYTES * sum(reader.head.voxels for reader in self.readers), evidence_bytes_max)

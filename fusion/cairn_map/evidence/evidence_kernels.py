@@ -83,21 +83,33 @@ def mix(x: np.uint64) -> np.uint64:
 
 
 @nb.njit(cache=True, nogil=True)
+def cell_seeds(cell: np.uint64) -> tuple[np.uint64, np.uint64]:
+    """Seeds of the two sums of a cell's fingerprint."""
+    return mix(cell), mix(~cell)
+
+
+@nb.njit(cache=True, nogil=True)
+def epoch_seeds(cell: np.uint64, epoch: np.int64) -> tuple[np.uint64, np.uint64]:
+    """The same for the row of an epoch: evidence that moves to another epoch has another fingerprint."""
+    step = np.uint64(epoch) + np.uint64(1)
+    return mix(mix(cell) + step), mix(mix(~cell) + step)
+
+
+@nb.njit(cache=True, nogil=True)
 def weighted_sums(
-    cell: np.uint64,
+    first_seed: np.uint64,
+    second_seed: np.uint64,
     voxels: npt.NDArray[np.uint32],
     counts: npt.NDArray[np.int32],
     sampled: npt.NDArray[np.uint32],
     samples: npt.NDArray[np.int64],
 ) -> tuple[np.uint64, np.uint64]:
-    """Two sums, mod 2^64, of value times the odd pseudo-random weight of (cell, voxel, plane).
+    """Two sums, mod 2^64, of value times the odd pseudo-random weight of (seed, voxel, plane).
 
     Planes 0 and 1 are hits and misses, those of samples follow. Sums mod 2^64 add as evidence adds; two of them with
     independent weights, because one of 64 bits would collide too often.
     """
     # The weight is odd, so that it has an inverse mod 2^64: no single change of a value is lost.
-    first_cell = mix(cell)
-    second_cell = mix(~cell)
     first = np.uint64(0)
     second = np.uint64(0)
     one = np.uint64(1)
@@ -107,14 +119,14 @@ def weighted_sums(
         for c in range(2):
             if counts[n, c] != 0:
                 value = np.uint64(np.int64(counts[n, c]))
-                first += value * (mix(first_cell ^ (place | np.uint64(c))) | one)
-                second += value * (mix(second_cell ^ (place | np.uint64(c))) | one)
+                first += value * (mix(first_seed ^ (place | np.uint64(c))) | one)
+                second += value * (mix(second_seed ^ (place | np.uint64(c))) | one)
     # Samples.
     for n in range(sampled.shape[0]):
         place = np.uint64(voxels[sampled[n]]) << np.uint64(8)
         for p in range(samples.shape[1]):
             if samples[n, p] != 0:
                 value = np.uint64(samples[n, p])
-                first += value * (mix(first_cell ^ (place | np.uint64(p + 2))) | one)
-                second += value * (mix(second_cell ^ (place | np.uint64(p + 2))) | one)
+                first += value * (mix(first_seed ^ (place | np.uint64(p + 2))) | one)
+                second += value * (mix(second_seed ^ (place | np.uint64(p + 2))) | one)
     return first, second

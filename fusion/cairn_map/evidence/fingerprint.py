@@ -11,7 +11,7 @@ import numpy as np
 
 from cairn_map.errors import DamagedDataError
 from cairn_map.evidence.evidence import Evidence
-from cairn_map.evidence.evidence_kernels import weighted_sums
+from cairn_map.evidence.evidence_kernels import cell_seeds, weighted_sums
 from cairn_map.evidence.grid import CellKey
 
 MASK = (1 << 64) - 1
@@ -45,7 +45,14 @@ ZERO = Fingerprint()
 
 def fingerprint(evidence: Evidence, key: CellKey) -> Fingerprint:
     """Fingerprint of one cell's evidence, which may have negative numbers."""
-    first, second = weighted_sums(np.uint64(key), evidence.voxels, evidence.counts, evidence.sampled, evidence.samples)
+    return fingerprint_of_seeds(evidence, cell_seeds(np.uint64(key)))
+
+
+def fingerprint_of_seeds(evidence: Evidence, seeds: tuple[np.uint64, np.uint64]) -> Fingerprint:
+    """Fingerprint of evidence under the two seeds of its cell, or of one row of it (`evidence_kernels`)."""
+    # Compiled code gives plain integers, and of such above 2^63 it takes none.
+    seed, other = map(np.uint64, seeds)
+    first, second = weighted_sums(seed, other, evidence.voxels, evidence.counts, evidence.sampled, evidence.samples)
     return Fingerprint(int(first), int(second))
 
 

@@ -64,10 +64,11 @@ def encode_head(head: CellHead) -> bytes:
         len(head.geometry.channels),
         head.streams,
     )
-    return data + _channel_bytes(head.geometry)
+    return data + channels_to_bytes(head.geometry)
 
 
-def _channel_bytes(geometry: Geometry) -> bytes:
+def channels_to_bytes(geometry: Geometry) -> bytes:
+    """Descriptors of a geometry's channels, as they stand in a head."""
     data = b""
     for channel in geometry.channels:
         name, unit = channel.name.encode(), channel.unit.encode()
@@ -107,9 +108,7 @@ def decode_head(data: bytes) -> tuple[CellHead, bytes]:
         raise DamagedDataError("bad_cell", "unknown flags, or a cell number out of range")
     at = FIXED_PART.size
     try:
-        for _ in range(channel_count):
-            _, name_bytes, unit_bytes = CHANNEL_SIZES.unpack_from(data, at)
-            at += CHANNEL_SIZES.size + name_bytes + unit_bytes + CHANNEL_SCALE.size
+        at = end_of_channels(data, at, channel_count)
         geometry = _geometry(edge_um, depth, channel_count, data[FIXED_PART.size : at])
     except (struct.error, UnicodeDecodeError, ValidationError) as exc:
         raise DamagedDataError("bad_cell", f"the cell's head is damaged: {str(exc).splitlines()[0]}") from exc
@@ -126,6 +125,32 @@ def decode_head(data: bytes) -> tuple[CellHead, bytes]:
     return head, data[:at]
 
 
+def end_of_channels(data: bytes, at: int, count: int) -> int:
+    """Offset behind so many descriptors of channels.
+
+    Raises:
+        struct.error: cut off.
+    """
+    for _ in range(count):
+        _, name_bytes, unit_bytes = CHANNEL_SIZES.unpack_from(data, at)
+        at += CHANNEL_SIZES.size + name_bytes + unit_bytes + CHANNEL_SCALE.size
+    return at
+
+
+def channels_from_bytes(data: bytes, count: int) -> tuple[Channel, ...]:
+    """Channels of their descriptors; the mirror of `channels_to_bytes`.
+
+    Raises:
+        struct.error, UnicodeDecodeError, ValidationError: cut off, or not channels.
+    """
+    channels: list[Channel] = []
+    at = 0
+    for _ in range(count):
+        channel, at = _channel(data, at)
+        channels.append(channel)
+    return tuple(channels)
+
+
 def is_canonical_head(head: CellHead, data: bytes) -> bool:
     """True if a head's own bytes, as `decode_head` gave them, are those that `encode_head` makes of it."""
     return _is_canonical(head.geometry, data[FIXED_PART.size :])  # pyright: ignore[reportArgumentType]
@@ -134,18 +159,13 @@ def is_canonical_head(head: CellHead, data: bytes) -> bool:
 @lru_cache(maxsize=16)
 def _is_canonical(geometry: Geometry, data: bytes) -> bool:
     """True for canonical channels; the numbers before them have one form only."""
-    return _channel_bytes(geometry) == data
+    return channels_to_bytes(geometry) == data
 
 
 @lru_cache(maxsize=16)
 def _geometry(edge_um: int, depth: int, channel_count: int, data: bytes) -> Geometry:
     """Geometry of a head; cached, because all cells of a map have the same one."""
-    channels: list[Channel] = []
-    at = 0
-    for _ in range(channel_count):
-        channel, at = _channel(data, at)
-        channels.append(channel)
-    return Geometry(voxel_edge_um=edge_um, depth=depth, channels=tuple(channels))
+    return Geometry(voxel_edge_um=edge_um, depth=depth, channels=channels_from_bytes(data, channel_count))
 
 
 def _channel(data: bytes, at: int) -> tuple[Channel, int]:

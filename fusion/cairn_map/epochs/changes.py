@@ -1,0 +1,211 @@
+"""Changes of a map between two times: the test of rule R3, never a mere comparison of two readings.
+
+A voxel has appeared or gone if all of this holds:
+
+    its readings before and after differ                     occupied or not
+    G > 10.83                                                 likelihood ratio of hits among observations, p = 0.001
+    it has at least 4 new observations
+    at least 4 of the 27 voxels around it changed the same way
+
+In a scene where nothing moved, readings alone differ in hundreds of voxels at each comparison, because poses and ranges
+are noisy. A voxel next to one that was occupied (appeared) or is occupied now (gone) may be a surface seen from a pose
+that is off by a voxel, and is reported apart. Temperatures change where the readings of both times have samples enough.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from cairn_map.arrays import Floats, Ints
+from cairn_map.epochs.cell_history import CellHistory
+from cairn_map.epochs.epoch import Epoch
+from cairn_map.epochs.present import Present, present
+from cairn_map.epochs.present_kernels import ALONE_MIN
+from cairn_map.errors import BadInputError
+from cairn_map.evidence.channels import ChannelKind
+from cairn_map.evidence.grid import CellKey, Geometry, voxels_in_cell
+from cairn_map.evidence.inverse_sensor_model import SensorModel
+
+G_MIN = 10.83
+"""Least likelihood ratio: chi-squared of one degree of freedom at p = 0.001."""
+NEW_MIN = 4
+"""Least count of new observations of a voxel."""
+TOGETHER_MIN = 4
+"""Least count of voxels, of the 27 around one and itself, that changed the same way."""
+WARMER_K = 5.0
+"""Least change of a temperature, kelvin: makers of uncooled cameras state an accuracy of 5 K."""
+EXTENT_MAX = 1 << 62
+"""Most voxels in the box around all cells that are compared."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapChanges:
+    """Voxels that changed between two times; each array is (N, 3) voxel numbers, rising."""
+
+    appeared: Ints
+    """Occupied now, and not before."""
+    gone: Ints
+    """Occupied before, and not now."""
+    moved: Ints
+    """Either of the two next to a surface that was or is there: mostly a pose that is off by a voxel."""
+    warmer: Ints
+    colder: Ints
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Part:
+    """Voxels of one cell that may have changed, and those that are occupied."""
+
+    appeared: Ints
+    gone: Ints
+    warmer: Ints
+    colder: Ints
+    was_occupied: Ints
+    is_occupied: Ints
+
+
+def map_changes(
+    cells: Mapping[CellKey, CellHistory],
+    geometry: Geometry,
+    model: SensorModel,
+    *,
+    since: Epoch,
+    until: Epoch | None = None,
+) -> MapChanges:
+    """Changes of a map after an epoch.
+
+    Args:
+        cells: histories of the cells that are compared; at a border to others fewer voxels stand together.
+        geometry: the map's.
+        model: inverse sensor model of both readings.
+        since: last epoch of the time before.
+        until: last epoch of the time after; None: the newest.
+
+    Raises:
+        BadInputError: kind `too_large`: the box around the cells has more than `EXTENT_MAX` voxels.
+    """
+    parts = [
+        _part_of(key, history if until is None else history.until(until), geometry, model, since)
+        for key, history in cells.items()
+        if any(epoch > since for epoch in history)
+    ]
+    lattice = _Lattice([voxels for part in parts for voxels in (part.was_occupied, part.is_occupied)])
+    was, now = (lattice.numbers([getattr(part, name) for part in parts]) for name in ("was_occupied", "is_occupied"))
+    # What stands together; and of it, what stands at a surface of the other time.
+    appeared = lattice.together([part.appeared for part in parts])
+    gone = lattice.together([part.gone for part in parts])
+    is_moved = (lattice.is_next_to(appeared, was), lattice.is_next_to(gone, now))
+    return MapChanges(
+        appeared=lattice.voxels(appeared[~is_moved[0]]),
+        gone=lattice.voxels(gone[~is_moved[1]]),
+        moved=lattice.voxels(np.concatenate([appeared[is_moved[0]], gone[is_moved[1]]])),
+        warmer=lattice.voxels(lattice.together([part.warmer for part in parts])),
+        colder=lattice.voxels(lattice.together([part.colder for part in parts])),
+    )
+
+
+def likelihood_ratio(before: Ints, after: Ints) -> Floats:
+    """(N,) G of (N, 2) hits and misses before and after: twice the sum of O ln(O / E) over the four counts.
+
+    It is 0 where either has no observations.
+    """
+    observed = np.stack([before, after], axis=1).astype(np.float64)
+    rows, columns = observed.sum(axis=2, keepdims=True), observed.sum(axis=1, keepdims=True)
+    expected = rows * columns / np.maximum(rows.sum(axis=1, keepdims=True), 1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        terms = np.where(observed > 0, observed * np.log(observed / expected), 0.0)
+    return np.asarray(2 * terms.sum(axis=(1, 2)))
+
+
+def _part_of(key: CellKey, history: CellHistory, geometry: Geometry, model: SensorModel, since: Epoch) -> _Part:
+    """Candidates of one cell."""
+    before, now = present(history, geometry, model, at=since), present(history, geometry, model)
+    # The voxels of `now` are all; where each was before.
+    rows = np.searchsorted(now.voxels, before.voxels)
+    counts = np.zeros_like(now.counts)
+    counts[rows] = before.counts
+    was = np.zeros(len(now), np.bool_)
+    was[rows] = before.occupied(model)
+    occupied = now.occupied(model)
+    # R3 a to c.
+    new = now.counts - counts
+    is_sure = (likelihood_ratio(counts, new) > G_MIN) & (new.sum(axis=1) >= NEW_MIN)
+    warmth = _warming(before, now, rows, geometry)
+
+    def numbers(mask: npt.NDArray[np.bool_]) -> Ints:
+        return voxels_in_cell(now.voxels[mask], key, geometry)
+
+    return _Part(
+        appeared=numbers(occupied & ~was & is_sure),
+        gone=numbers(was & ~occupied & is_sure),
+        warmer=numbers(occupied & (warmth > WARMER_K)),
+        colder=numbers(occupied & (warmth < -WARMER_K)),
+        was_occupied=numbers(was),
+        is_occupied=numbers(occupied),
+    )
+
+
+def _warming(before: Present, now: Present, rows: npt.NDArray[np.intp], geometry: Geometry) -> Floats:
+    """(V,) kelvin by which the first temperature channel reads more than before; 0 where either has few samples."""
+    means = np.full((2, len(now)), np.nan)
+    channel = next((c for c in geometry.channels if c.kind is ChannelKind.TEMPERATURE), None)
+    if channel is None:
+        return np.zeros(len(now))
+    planes = geometry.planes_of(channel.name)
+    for n, (reading, places) in enumerate([(before, rows), (now, np.arange(len(now)))]):
+        sums, weights = reading.samples[:, planes.start], reading.samples[:, planes.stop - 1]
+        has = weights >= ALONE_MIN
+        means[n, places[reading.sampled[has]]] = sums[has] / weights[has] * channel.step
+    return np.asarray(np.nan_to_num(means[1] - means[0]))
+
+
+class _Lattice:
+    """Numbers of voxels in the box around some, with a margin of one, so that neighbours have known distances."""
+
+    def __init__(self, voxels: list[Ints]) -> None:
+        everything = np.concatenate([*voxels, np.zeros((0, 3), np.int64)])
+        low, high = (
+            (everything.min(axis=0), everything.max(axis=0)) if len(everything) else (np.zeros(3, np.int64),) * 2
+        )
+        self._low = low - 1
+        self._sides = [int(side) for side in high - low + 3]
+        if self._sides[0] * self._sides[1] * self._sides[2] > EXTENT_MAX:
+            raise BadInputError("too_large", f"cells {self._sides} voxels apart cannot be compared at once; give a box")
+        _, y, z = self._sides
+        self._strides = np.array([y * z, z, 1], np.int64)
+        steps = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+        self._around = steps @ self._strides
+
+    def numbers(self, parts: list[Ints]) -> Ints:
+        """Numbers of voxels, rising."""
+        voxels = np.concatenate([*parts, np.zeros((0, 3), np.int64)])
+        return np.sort((voxels - self._low) @ self._strides)
+
+    def voxels(self, numbers: Ints) -> Ints:
+        """(N, 3) voxels of numbers, rising in number; the mirror of `numbers`."""
+        rising = np.sort(numbers)
+        _, y, z = self._sides
+        return np.stack([rising // (y * z), rising // z % y, rising % z], axis=1) + self._low
+
+    def together(self, parts: list[Ints]) -> Ints:
+        """Numbers of the voxels around which, with themselves, there are `TOGETHER_MIN` of these at least."""
+        numbers = self.numbers(parts)
+        count = np.zeros(len(numbers), np.int64)
+        for step in self._around:
+            count += _isin(numbers + step, numbers)
+        return numbers[count >= TOGETHER_MIN]
+
+    def is_next_to(self, numbers: Ints, others: Ints) -> npt.NDArray[np.bool_]:
+        """(N,) True where one of the 26 voxels around a number is one of the others."""
+        found = np.zeros(len(numbers), np.bool_)
+        for step in self._around[self._around != 0]:
+            found |= _isin(numbers + step, others)
+        return found
+
+
+def _isin(numbers: Ints, rising: Ints) -> npt.NDArray[np.bool_]:
+    places = np.searchsorted(rising, numbers)
+    found: npt.NDArray[np.bool_] = np.append(rising, -1)[places] == numbers
+    return found

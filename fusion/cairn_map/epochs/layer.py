@@ -1,0 +1,76 @@
+"""The definition of a layer of a map: its grid and the length of its epochs. Its digest names all that is stored of it.
+
+A layer is named by its definition, not by a number: two servers that define the same layer can be joined. A map without
+epochs has one layer, whose digest is that of its geometry alone, as in format version 1.
+"""
+
+import hashlib
+import json
+from functools import lru_cache
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from cairn_map.epochs.epoch import EPOCH_S_MAX
+from cairn_map.evidence.grid import Geometry
+
+EVIDENCE = "evidence"
+"""Name of a map's first layer."""
+
+
+Hex32 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+LayerName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,31}$")]
+EpochLength = Annotated[int, Field(ge=1, le=EPOCH_S_MAX)]
+
+
+class LayerIdentity(BaseModel, frozen=True):
+    """Definition of a layer with epochs, as commits state it: its geometry by its digest."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    geometry: Hex32
+    epoch_s: EpochLength
+    kind: Literal["evidence"] = "evidence"
+    name: LayerName = EVIDENCE
+
+    def digest(self) -> bytes:
+        """SHA-256 (32 bytes) over the definition as JSON, with sorted keys."""
+        text = json.dumps(self.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
+        return hashlib.sha256(text.encode()).digest()
+
+
+class MapLayer(BaseModel, frozen=True):
+    """One layer of a map."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    geometry: Geometry = Geometry()
+    epoch_s: EpochLength | None = None
+    """Length of an epoch, seconds; None: one sum for all times, in the bytes of format version 1."""
+    name: LayerName = EVIDENCE
+
+    @property
+    def has_epochs(self) -> bool:
+        """True if evidence is kept by epoch, in the bytes of format version 2."""
+        return self.epoch_s is not None
+
+    @property
+    def identities(self) -> tuple[LayerIdentity, ...]:
+        """Its definition, if it has epochs, as the commits of its map state it."""
+        if self.epoch_s is None:
+            return ()
+        return (LayerIdentity(geometry=self.geometry.digest().hex(), epoch_s=self.epoch_s, name=self.name),)
+
+    def digest(self) -> bytes:
+        """SHA-256 (32 bytes) over the definition; evidence can be added only if the digests are equal."""
+        return _digest(self)
+
+    @property
+    def word(self) -> int:
+        """Number of 64 bits that fingerprints of this layer's evidence are made with; 0 without epochs."""
+        return int.from_bytes(self.digest()[:8], "little") if self.has_epochs else 0
+
+
+@lru_cache(maxsize=64)
+def _digest(layer: MapLayer) -> bytes:
+    return layer.identities[0].digest() if layer.has_epochs else layer.geometry.digest()
