@@ -2,16 +2,22 @@
 
     $ cairn sim scene                                  # the scenes, robots and paths that come with cairn
     $ cairn sim show building --path labs --stop 3     # what a head sees there, as pictures
+    $ cairn sim show moving-building --stop 3 --time 3700    # ... after an hour and a bit, when a door is open
     $ cairn sim record building lab-1 --path experiment --robot tof
+    $ cairn sim record moving-building day --path labs --robot tof --rounds 3 --hours 2
     $ cairn sim evaluate-fusion pictures/              # fused images against the truth, and the paper's Fig. 24
     $ cairn robot replay lab-1 --map http://127.0.0.1:8750/maps/lab
 
 A recording is like a real robot's; the truth behind every image lies in its folder truth/. The path
 `experiment` of the building is the paper's: 54 stops of 36 scans. The same seed gives the same bytes.
+
+In a scene that moves, each scan shows what is where at its own time. `--rounds` and `--hours` visit the stops at even
+times over hours; nothing is rendered between them.
 """
 
 import argparse
 import math
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import fields
@@ -29,12 +35,14 @@ from cairn_sim.robots.record import Plan, places_of, record, shots_of
 from cairn_sim.robots.robots import ROBOTS, robot_named
 from cairn_sim.robots.targets import TARGET_SCENES
 from cairn_sim.robots.trajectories import PoseErrors, path_names
+from cairn_sim.scene.movements import CLOCK_START_S
 from cairn_sim.scene.scene import Scene
 from cairn_sim.scene.scene_file import SHIPPED, load_scene, shipped_text
 from cairn_sim.scene.scene_format import ZERO_C_K
 
 MEGABYTES_PER_SCAN = {"orpheus": 4.8, "tof": 0.24, "lidar": 0.2, "handheld": 3.1}
 """Bytes of a recording at full size with the truth of the range camera, measured in the building."""
+SECONDS_MAX = 1e9
 TRUTH_FACTORS = {"none": 0.95, "range": 1.0, "all": 2.1}
 
 
@@ -50,10 +58,11 @@ def _scene(args: argparse.Namespace) -> int:
     if args.scene is None:
         for name in [*SHIPPED, *TARGET_SCENES]:
             scene = _load(name)
-            say(f"{name:12} {len(scene.solids):4} solids; paths: {', '.join(path_names(name))}")
+            moving = f", {len(scene.moving)} objects move" if scene.moving else ""
+            say(f"{name:15} {len(scene.solids):4} solids{moving}; paths: {', '.join(path_names(name))}")
         say()
         for robot in ROBOTS.values():
-            say(f"{robot.name:12} {robot.about}")
+            say(f"{robot.name:15} {robot.about}")
         return 0
     scene = _load(args.scene)
     if args.write is not None:
@@ -72,6 +81,10 @@ def _scene(args: argparse.Namespace) -> int:
         say(f"  spans        {span}")
     low_c, high_c, ambient_c = (k - ZERO_C_K for k in (kelvin.min(), kelvin.max(), scene.ambient_k))
     say(f"  temperature  {low_c:.1f} to {high_c:.1f} C, around it {ambient_c:.1f} C")
+    for each in scene.moving:
+        times_s, repeat_s = [keyframe.time_s for keyframe in each.movement.keyframes], each.movement.repeat_s
+        again = "" if repeat_s is None else f", again every {repeat_s:g} s"
+        say(f"  moves        {each.name}: {times_s[0]:g} to {times_s[-1]:g} s{again}")
     say(f"  paths        {', '.join(path_names(scene.name)) or '(none: cairn knows paths of its own scenes only)'}")
     return 0
 
@@ -82,13 +95,36 @@ def _record(args: argparse.Namespace) -> int:
     shots = shots_of(plan)
     stop_count = sum(shot.ends_stop for shot in shots)
     say(f"{plan.robot.name} in {plan.scene.name}, path {plan.path}: {stop_count} measurements, {len(shots)} scans")
+    say(f"  goes on for {_span_of_time(shots[-1].time_s - shots[0].time_s)} of the scene's time")
     if args.scale == 1:
         size_mb = len(shots) * MEGABYTES_PER_SCAN[plan.robot.name] * TRUTH_FACTORS[args.truth]
         say(f"  takes about {size_mb / 1000:.2g} GB")
+        _check_room(args.output, size_mb)
     for _ in with_progress(record(plan, args.output, scene_text=_text(args.scene)), "scans", total=len(shots)):
         pass
     say(f"wrote {args.output}; its truth is in {args.output / 'truth'}")
     return 0
+
+
+def _check_room(folder: Path, size_mb: float) -> None:
+    """Refuse a recording that its disk has no room for."""
+    above = next((each for each in (folder.absolute(), *folder.absolute().parents) if each.exists()), Path("/"))
+    usage = shutil.disk_usage(above)
+    free_mb = usage.free / 1e6
+    # One of no size at all is no disk: what is wrong with it is said when it is written.
+    if usage.total and size_mb > free_mb:
+        raise BadInputError(
+            "no_space",
+            f"the recording takes about {size_mb / 1000:.2g} GB, {above} has {free_mb / 1000:.2g} GB left; choose "
+            "another folder, fewer rounds or stops, a smaller --scale, or --truth none",
+        )
+
+
+def _span_of_time(seconds: float) -> str:
+    """A time for people: 45 s, 12 min, 2.0 h."""
+    if seconds < 60:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 3600 else f"{seconds / 3600:.1f} h"
 
 
 def _show(args: argparse.Namespace) -> int:
@@ -97,6 +133,7 @@ def _show(args: argparse.Namespace) -> int:
     shots = [shot for shot in shots_of(plan) if (shot.stop, shot.scan) == (args.stop, args.scan)]
     if not shots:
         raise BadInputError("no_stops", f"path {plan.path} has no stop {args.stop} with a scan {args.scan}")
+    time_s = shots[0].time_s if args.time is None else CLOCK_START_S + args.time
     above = args.output.with_name(f"{args.output.stem}-plan.png") if args.output.name else args.output
     with _output(args.output):
         args.output.touch()
@@ -105,14 +142,14 @@ def _show(args: argparse.Namespace) -> int:
         plan.robot.rig_of(plan.scale),
         T_map_rig=shots[0].T_map_rig,
         range_camera=RANGE_CAMERA,
-        time_s=shots[0].time_s,
+        time_s=time_s,
         noise=plan.noise,
         number=shots[0].number,
         sensors=plan.robot.sensors,
     )
     with _output(args.output):
         write_colour(args.output, contact_sheet(scan))
-        write_colour(above, view_from_above(plan.scene, places_of(plan), args.stop))
+        write_colour(above, view_from_above(plan.scene.at(time_s), places_of(plan), args.stop))
     say(f"wrote {args.output}: what {plan.robot.name} sees at stop {args.stop}, scan {args.scan}, of {plan.path}")
     say(f"wrote {above}: {plan.scene.name} from above")
     return 0
@@ -143,6 +180,8 @@ def _plan(args: argparse.Namespace) -> Plan:
         backlash_rad=math.radians(args.backlash_deg),
         speed_m_s=args.speed,
         rate_hz=args.rate,
+        rounds=args.rounds,
+        lasts_s=args.hours * 3600,
         first_stop=args.stops[0],
         last_stop=args.stops[1],
     )
@@ -176,6 +215,16 @@ def _span(text: str) -> tuple[int, int | None]:
     return int(first or 0), int(last) if last else None
 
 
+def _seconds(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0 <= value <= SECONDS_MAX:
+        raise argparse.ArgumentTypeError(f"a time is 0 to {SECONDS_MAX:g} seconds, got {text!r}")
+    return value
+
+
 def _parser() -> argparse.ArgumentParser:
     options = parser("cairn sim", __doc__)
     actions = options.add_subparsers(dest="action", required=True, metavar="ACTION")
@@ -193,9 +242,16 @@ def _parser() -> argparse.ArgumentParser:
         "--stops", type=_span, default=(0, None), metavar="FROM:TO", help="a part of the stops (all)"
     )
     recording.add_argument("--raw", action="store_true", help="thermal images as raw counts, too")
-    show.set_defaults(truth="none", raw=False, stops=(0, None))
+    recording.add_argument("--rounds", type=int, default=1, metavar="N", help="times along the path (1)")
+    recording.add_argument(
+        "--hours", type=float, default=0.0, metavar="H", help="of the scene's time, with pauses between stops (0: none)"
+    )
+    show.set_defaults(truth="none", raw=False, stops=(0, None), rounds=1, hours=0.0)
     show.add_argument("--output", type=Path, default=Path("view.png"), metavar="FILE", help="picture (view.png)")
     show.add_argument("--stop", type=int, default=0, help="of the path, from 0 (0)")
+    show.add_argument(
+        "--time", type=_seconds, metavar="S", help="seconds after the scene's start (as in a recording of the path)"
+    )
     show.add_argument("--scan", type=int, default=0, help="of the stop, from 0 (0)")
     for one in (recording, show):
         _add_plan(one)

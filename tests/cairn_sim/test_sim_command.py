@@ -1,5 +1,6 @@
 """`cairn sim` as a user types it."""
 
+import shutil
 from pathlib import Path
 
 import cv2
@@ -59,6 +60,54 @@ def test_record_writes_a_recording(tmp_path: Path, capsys: pytest.CaptureFixture
     assert (folder / "truth" / "tof" / "000035.npz").exists()
     with pytest.raises(ConflictError, match="must be empty"):
         main(arguments)
+
+
+def test_scene_says_what_moves_and_when(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["scene", "moving-building"]) == 0
+    out = capsys.readouterr().out
+    assert "lab 1 door: 3600 to 7203 s" in out and "visitor: 0 to 20 s, again every 20 s" in out
+
+
+def test_show_shows_a_time(tmp_path: Path) -> None:
+    arguments = ["show", "moving-yard", "--robot", "tof", "--stop", "4", "--scan", "19", "--perfect"]
+    pictures = []
+    for seconds in ("0", "1700", "5401"):
+        picture = tmp_path / f"{seconds}.png"
+        assert main([*arguments, "--time", seconds, "--output", str(picture)]) == 0
+        plan = cv2.imread(str(tmp_path / f"{seconds}-plan.png"))
+        assert plan is not None
+        pictures.append(plan)
+    # The walker is elsewhere; then the car is gone, too.
+    walked, driven = ((pictures[0] != other).any(axis=2).sum() for other in pictures[1:])
+    assert 0 < walked < driven
+
+
+@pytest.mark.parametrize("time", ["-1", "x", "nan", "1e10"])
+def test_a_time_that_is_none_is_refused(time: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["show", "moving-yard", f"--time={time}"])
+    assert "seconds" in capsys.readouterr().err
+
+
+def test_record_goes_on_for_hours_and_renders_only_its_stops(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "day"
+    arguments = ["record", "moving-yard", str(folder), "--robot", "lidar", "--stops", "3", "--rounds", "4"]
+    assert main([*arguments, "--hours", "2", "--truth", "none"]) == 0
+    assert "4 measurements, 4 scans\n  goes on for 1.5 h" in capsys.readouterr().out
+    recording = open_recording(folder)
+    times_s = [recording.scan(n).time_s for n in range(4)]
+    np.testing.assert_allclose(np.diff(times_s), 1800)
+
+
+def test_a_recording_that_the_disk_has_no_room_for_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=10**6))
+    with pytest.raises(BadInputError, match=r"takes about .* GB, .* has 0.001 GB left") as caught:
+        main(["record", "small-room", str(tmp_path / "far" / "away"), "--robot", "tof"])
+    assert caught.value.kind == "no_space"
+    assert not (tmp_path / "far").exists()
 
 
 @pytest.mark.parametrize("stops", ["x", "3-4", "-1:2", ":"])

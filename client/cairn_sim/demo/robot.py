@@ -15,7 +15,8 @@ from cairn_sim.render.render import render_scan
 from cairn_sim.render.sensors import Noise
 from cairn_sim.robots.heads import RANGE_CAMERA
 from cairn_sim.robots.kinematics import Manipulator, measurement_joints
-from cairn_sim.robots.record import CLOCK_START_S, SCAN_S
+from cairn_sim.robots.record import SCAN_S
+from cairn_sim.scene.movements import CLOCK_START_S
 from cairn_sim.scene.scene import Scene
 
 

@@ -73,7 +73,8 @@ def scored_view(scene: Scene, rig: Rig, scan: Scan, camera: str) -> ScoredView:
     """A camera's fused image and its scores, in all ways."""
     unit = "K" if rig[camera].spectrum is Spectrum.COLOUR else "of 255"
     images = source_order(scan, rig, camera)
-    truth = fusion_truth(scene, rig, camera, list(images), T_map_rig=scan.T_map_rig, range_camera=scan.range_camera)
+    now = scene.at(scan.time_s)
+    truth = fusion_truth(now, rig, camera, list(images), T_map_rig=scan.T_map_rig, range_camera=scan.range_camera)
     surface = surface_of(scan, rig)
     drawn = {name: drawn_surface(surface, rig, name) for name in (camera, *images)}
     depth = view_depth(scan, rig, camera, drawn[camera])

@@ -4,6 +4,9 @@
     seen_marks    dense rays without noise, each to its first surface
     truths_of     both, as one class a voxel; `scores` compares a map with it
 
+Of a scene that moves they tell its start; `scene.at(time_s)` has the truth at a time, `moving_truth` what cameras knew
+of it that looked at many.
+
 A ray counts if its first surface, glass and mirrors too, is within the camera's range; a ray that meets nothing there
 marks nothing, because a camera to which nothing comes back says nothing (`cairn_fusion.recording.scan`). Voxels and
 rounding are the map's own: a point on a border belongs to the upper voxel. So a wall that lies on the grid's own lines
@@ -151,6 +154,8 @@ def solid_masks(scene: Scene, box: VoxelBox) -> Masks:
     low_m, _ = box.bounds_m
     shapes = scene.shapes
     for k, solid in enumerate(scene.solids):
+        if k in scene.gone:
+            continue
         lowest, highest = solid.bounds_m()
         start = np.clip(np.floor((lowest - TOUCH_M - low_m) / box.voxel_edge_m), 0, box.shape).astype(np.int64)
         stop = np.clip(np.ceil((highest + TOUCH_M - low_m) / box.voxel_edge_m), 0, box.shape).astype(np.int64)
@@ -241,7 +246,7 @@ def truth_from(box: VoxelBox, masks: Masks, marks: Marks) -> Truth:
     classes[seen == PASSED] = TruthClass.FREE
     classes[samples >= HALF_SOLID] = TruthClass.SOLID
     classes[seen == HIT] = TruthClass.SURFACE
-    return Truth(box, classes, samples, _near((masks != 0) | (marks == HIT)))
+    return Truth(box, classes, samples, near_flags((masks != 0) | (marks == HIT)))
 
 
 def _finer_rays(camera: AnyCamera, fineness: int) -> Floats:
@@ -251,7 +256,7 @@ def _finer_rays(camera: AnyCamera, fineness: int) -> Floats:
     return camera.unproject(np.stack([x + a, y + b], axis=-1).reshape(-1, 2))
 
 
-def _near(flags: Flags) -> Flags:
+def near_flags(flags: Flags) -> Flags:
     """Flags dilated by one voxel in all 26 directions; of all voxels but the outermost."""
     flags = flags[:-2] | flags[1:-1] | flags[2:]
     flags = flags[:, :-2] | flags[:, 1:-1] | flags[:, 2:]

@@ -118,7 +118,10 @@ def recorded_robot(folder: Path, *, stops: int | None) -> ExperimentRobot:
 
 
 def _truth(folder: Path, rig: Rig, range_camera: str, times_s: Sequence[float]) -> KnownTruth | None:
-    """The truth in a folder; None where there is none, or where its scene was made by a program and has no file."""
+    """The truth in a folder; None where there is none, or where its scene has no file, or moves.
+
+    The experiment compares with a world that stands still: the map is one sum over all times.
+    """
     scene, trajectory = folder / "scene.toml", folder / "trajectory.txt"
     if not (scene.is_file() and trajectory.is_file()):
         return None
@@ -126,9 +129,12 @@ def _truth(folder: Path, rig: Rig, range_camera: str, times_s: Sequence[float]) 
         lines = file.read(FILE_BYTES_MAX).splitlines()
     if all(not line or line.startswith(b"#") for line in lines):
         return None
+    known = load_scene(scene)
+    if known.moving:
+        return None
     true = read_trajectory(trajectory)
     T_rig_camera = rig[range_camera].transform
     return KnownTruth(
-        scene=load_scene(scene),
+        scene=known,
         T_map_cameras=[true.pose_at(time_s, max_gap_s=0.0) @ T_rig_camera for time_s in times_s],
     )

@@ -102,10 +102,10 @@ def render_scan(
     sensors: Mapping[str, Sensor] | None = None,
     threads: int | None = None,
 ) -> Scan:
-    """All images of one head pose. Range cameras other than `range_camera` stay dark.
+    """All images of one head pose, at one time. Range cameras other than `range_camera` stay dark.
 
     Args:
-        scene: what is there.
+        scene: what is there; what moves is where it is at `time_s` in every image.
         rig: the head.
         T_map_rig: where it truly is; the scan carries it as its pose.
         range_camera: the one that measures.
@@ -122,9 +122,10 @@ def render_scan(
         raise BadInputError("bad_scan", f"{range_camera} must be a range camera, it is {rig[range_camera].spectrum}")
     # Other range cameras would disturb the one that measures: they stay dark.
     names = [name for name, m in rig.cameras.items() if m.spectrum is not Spectrum.RANGE or name == range_camera]
+    now = scene.at(time_s)
 
     def render(name: str) -> tuple[npt.NDArray[np.generic], ...]:
-        view = view_of(scene, rig, name, T_map_rig=T_map_rig)
+        view = view_of(now, rig, name, T_map_rig=T_map_rig)
         sensor = (sensors or {}).get(name, SENSORS[rig[name].spectrum])
         own = None
         if noise is not None:

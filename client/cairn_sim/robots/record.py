@@ -10,6 +10,14 @@
 
 Scans are rendered side by side and written in order. Every image's noise depends on the seed, the camera and the scan's
 number alone, so the same plan gives the same bytes on one machine, whatever the number of cores.
+
+A recording of hours visits its stops at even times, round after round, and renders nothing between them:
+
+    rounds = 3, lasts_s = 7200      |stop 0 .. stop 25|        |stop 0 .. stop 25|        |stop 0 .. stop 25|
+                                    0 s                        2400 s                     4800 s           7200 s
+
+The 36 scans of a stop take 18 s; between two stops the robot stands still. All images of a scan show the scene as it is
+at the scan's time.
 """
 
 import json
@@ -36,15 +44,16 @@ from cairn_sim.render.truth import CameraTruth, camera_truth
 from cairn_sim.robots.heads import RANGE_CAMERA
 from cairn_sim.robots.robots import SimRobot
 from cairn_sim.robots.trajectories import PoseErrors, believed, drive, stops
+from cairn_sim.scene.movements import CLOCK_START_S
 from cairn_sim.scene.scene import Scene
 
-CLOCK_START_S = 1_760_000_000.0
-"""Time stamp of the first scan."""
 SCAN_S = 0.5
 """From one head pose to the next, at a stop."""
 MILLIMETRES_REACH_M = 65.0
 AHEAD = 2
 """Scans rendered before their turn to be written, for each thread."""
+SCANS_MAX = 200_000
+"""Scans of a plan: their poses take some 200 MB."""
 Truths = Literal["none", "range", "all"]
 
 
@@ -71,7 +80,12 @@ class Plan:
     """0: the robot stops along the path; else it drives through, and every scan is a measurement."""
     rate_hz: float = 5.0
     """Scans a second of a drive."""
+    rounds: int = 1
+    """Times that the robot goes along the path."""
+    lasts_s: float = 0.0
+    """Time over which the stops, or the rounds of a drive, are evenly spread; 0: one follows at once on the other."""
     first_stop: int = 0
+    """The first stop that is recorded, in each round."""
     last_stop: int | None = None
     """The first stop that is not recorded; None for all."""
 
@@ -81,6 +95,11 @@ class Plan:
                 "bad_plan",
                 "a recording needs a seed from 0, a speed from 0 m/s and a rate above 0 Hz, got "
                 f"{self.seed}, {self.speed_m_s:g}, {self.rate_hz:g}",
+            )
+        if self.rounds < 1 or not 0 <= self.lasts_s < math.inf:
+            raise BadInputError(
+                "bad_plan",
+                f"a recording needs at least 1 round, and a time from 0 s, got {self.rounds} and {self.lasts_s:g} s",
             )
         if not 0 <= self.backlash_rad < 1:
             raise BadInputError("bad_plan", f"backlash must be 0 to 1 rad (57 degrees), got {self.backlash_rad:g} rad")
@@ -98,6 +117,7 @@ class Shot:
     number: int
     """Number of the scan along the path."""
     stop: int
+    """Number of the stop along the path, the same in each round."""
     scan: int
     """Number of the scan at its stop."""
     time_s: float
@@ -123,36 +143,62 @@ def shots_of(plan: Plan) -> list[Shot]:
     """The scans of a plan, in order.
 
     Raises:
-        BadInputError: the scene has no such path, or no such stops.
+        BadInputError: the scene has no such path, or no such stops; too many scans, or too little time for them.
     """
     rng, places = Noise(plan.seed).of_poses(), places_of(plan)
     if not places[plan.first_stop : plan.last_stop]:
         raise BadInputError("no_stops", f"path {plan.path} has {len(places)} stops, none of them chosen")
     robot = replace(plan.robot, scans=(1, 1)) if plan.speed_m_s > 0 else plan.robot
-    scan_s = 1 / plan.rate_hz if plan.speed_m_s > 0 else SCAN_S
-    told = [T for place in believed(places, plan.errors, rng) for T in robot.head_poses(place)]
+    per_stop, per_round = robot.scans_per_stop, len(places) * robot.scans_per_stop
+    if plan.rounds * per_round > SCANS_MAX:
+        raise BadInputError(
+            "bad_plan", f"a recording has at most {SCANS_MAX} scans, got {plan.rounds} rounds of {per_round}"
+        )
+    times_s = _scan_times_s(
+        plan, per_visit=per_round if plan.speed_m_s > 0 else per_stop, count=plan.rounds * per_round
+    )
+    way = places * plan.rounds
+    told = [T for place in believed(way, plan.errors, rng) for T in robot.head_poses(place)]
     gap = plan.backlash_rad
-    true = robot.true_head_poses(places, gap_rad=gap, sigma_rad=gap / 10, rng=rng)
+    true = robot.true_head_poses(way, gap_rad=gap, sigma_rad=gap / 10, rng=rng)
     shots = [
         Shot(
             number=number,
-            stop=number // robot.scans_per_stop,
-            scan=number % robot.scans_per_stop,
-            time_s=CLOCK_START_S + number * scan_s,
+            stop=number % per_round // per_stop,
+            scan=number % per_stop,
+            time_s=time_s,
             T_map_rig=T,
             T_believed=T_believed,
-            ends_stop=(number + 1) % robot.scans_per_stop == 0,
+            ends_stop=(number + 1) % per_stop == 0,
         )
-        for number, (T, T_believed) in enumerate(zip(true, told, strict=True))
+        for number, (time_s, T, T_believed) in enumerate(zip(times_s, true, told, strict=True))
     ]
     last = len(places) if plan.last_stop is None else plan.last_stop
     return [shot for shot in shots if plan.first_stop <= shot.stop < last]
 
 
+def _scan_times_s(plan: Plan, *, per_visit: int, count: int) -> list[float]:
+    """UTC of each of `count` scans; a visit, which nothing interrupts, is a stop, or a round of a drive."""
+    scan_s = 1 / plan.rate_hz if plan.speed_m_s > 0 else SCAN_S
+    if plan.lasts_s == 0:
+        return [CLOCK_START_S + number * scan_s for number in range(count)]
+    visit_s = plan.lasts_s * per_visit / count
+    if visit_s < per_visit * scan_s:
+        raise BadInputError(
+            "bad_plan",
+            f"{count} scans take {count * scan_s / 3600:.2g} h at least, got {plan.lasts_s / 3600:.2g} h; "
+            "choose more hours or fewer rounds",
+        )
+    return [CLOCK_START_S + number // per_visit * visit_s + number % per_visit * scan_s for number in range(count)]
+
+
 def scans_of(
     plan: Plan, shots: Sequence[Shot], rig: Rig, *, threads: int | None = None
 ) -> Iterator[tuple[Shot, Scan, dict[str, CameraTruth]]]:
-    """Each shot with its scan and the truth behind its images, in order; rendered side by side (None: on all cores)."""
+    """Each shot with its scan and the truth behind its images, in order; rendered side by side (None: on all cores).
+
+    At most `AHEAD` scans a thread are held, however many there are.
+    """
     cameras = {"none": [], "range": [RANGE_CAMERA], "all": list(rig.cameras)}[plan.truth]
 
     def take(shot: Shot) -> tuple[Shot, Scan, dict[str, CameraTruth]]:
@@ -167,7 +213,8 @@ def scans_of(
             sensors=plan.robot.sensors,
             threads=1,
         )
-        truths = {name: camera_truth(plan.scene, rig, name, T_map_rig=shot.T_map_rig) for name in cameras}
+        scene = plan.scene.at(shot.time_s)
+        truths = {name: camera_truth(scene, rig, name, T_map_rig=shot.T_map_rig) for name in cameras}
         return shot, replace(scan, T_map_rig=shot.T_believed), truths
 
     workers = threads or os.cpu_count() or 1

@@ -24,7 +24,8 @@ from cairn_sim.scene.solids import placed
 Xy = tuple[float, float]
 
 EXPERIMENT = "experiment"
-"""The path of the building that is the paper's: `labs`, then `corridors`."""
+"""The path of the building that is the paper's, all of `PAPERS_PATHS` one after the other."""
+PAPERS_PATHS = ("labs", "corridors")
 POSES_MAX = 100_000
 """Poses of one drive at most."""
 ERROR_MAX = 100.0
@@ -48,6 +49,11 @@ class Route:
     """Part of the path, as shares of its length, in which stops stand closer."""
 
 
+BUILDING = {
+    "labs": Route(((15.2, 6.2), (15.2, 23.7)), -0.1, 0.7, 0.1),
+    "corridors": Route(((1.3, 0.0), (30.8, 0.0), (30.8, -8.3)), -0.1, 1.4, 0.4, (0.35, 0.55)),
+}
+YARD = {"loop": Route(((-6.0, -6.0), (5.25, -6.0), (5.25, 6.8), (-6.0, 6.8), (-6.0, -5.0)), 3.0, 2.0)}
 PATHS: Mapping[str, Mapping[str, Route]] = MappingProxyType(
     {
         "small-room": {
@@ -57,15 +63,12 @@ PATHS: Mapping[str, Mapping[str, Route]] = MappingProxyType(
             "doorway": Route(((1.9, 1.6), (2.2, 2.3), (2.9, 2.45), (5.2, 2.45)), 1.1, 0.65),
             "east": Route(((5.0, 1.2), (4.8, 1.8), (5.1, 2.4), (5.0, 3.1), (4.75, 4.4)), 1.1, 0.66),
         },
-        "building": {
-            "labs": Route(((15.2, 6.2), (15.2, 23.7)), -0.1, 0.7, 0.1),
-            "corridors": Route(((1.3, 0.0), (30.8, 0.0), (30.8, -8.3)), -0.1, 1.4, 0.4, (0.35, 0.55)),
-        },
+        "building": BUILDING,
+        "moving-building": BUILDING,
         "calibration": {"views": Route(((0.0, -0.8), (0.7, 0.0), (0.0, 0.8)), 1.1, 0.4)},
         "targets": {"approach": Route(((-0.5, 0.0), (1.8, 0.0)), 1.1, 0.45)},
-        "yard": {
-            "loop": Route(((-6.0, -6.0), (5.25, -6.0), (5.25, 6.8), (-6.0, 6.8), (-6.0, -5.0)), 3.0, 2.0),
-        },
+        "yard": YARD,
+        "moving-yard": YARD,
     }
 )
 """By scene and name. West and east of the small room share no stop's view but through the doorway."""
@@ -74,7 +77,7 @@ PATHS: Mapping[str, Mapping[str, Route]] = MappingProxyType(
 def path_names(scene: str) -> list[str]:
     """Names that `stops` knows for a scene."""
     names = list(PATHS.get(scene, ()))
-    return [*names, EXPERIMENT] if scene == "building" else names
+    return [*names, EXPERIMENT] if set(PAPERS_PATHS) <= set(names) else names
 
 
 def stops(scene: Scene, path: str) -> list[Transform]:
@@ -83,8 +86,8 @@ def stops(scene: Scene, path: str) -> list[Transform]:
     Raises:
         BadInputError: the scene has no such path, or no ground below it.
     """
-    if path == EXPERIMENT and scene.name == "building":
-        return [*stops(scene, "labs"), *stops(scene, "corridors")]
+    if path == EXPERIMENT and path in path_names(scene.name):
+        return [T for name in PAPERS_PATHS for T in stops(scene, name)]
     line = _path(scene, path)
     length_m = _lengths(line.waypoints)[-1]
     return [on_ground(scene, line, at) for at in _stop_lengths(line, float(length_m))]

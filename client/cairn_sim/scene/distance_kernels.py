@@ -24,8 +24,9 @@ def nearest_solids(points: Floats, shapes: Shapes) -> tuple[Floats, Int32s]:
             continue
         nearest = np.inf
         for k in range(len(kind)):
-            # The box around a solid bounds its distance from below, at a tenth of the price.
-            if _outside_box(x, y, z, bounds, k) > nearest:
+            # The box around a solid bounds its distance from below, at a tenth of the price; one that is gone is
+            # infinitely far.
+            if _outside_box(x, y, z, bounds, k) >= nearest:
                 continue
             distance = _distance(x, y, z, k, kind, frame, half_m)
             if distance < nearest:

@@ -1,11 +1,13 @@
 """A scene that is known exactly: solids, the light around them, and the same as arrays for the kernels.
 
 Three questions about the truth have exact answers: which solid is at a point (`Scene.solid_at`), how far the nearest
-surface is and how warm (`Scene.distance_m`, `Scene.temperature_k_at`), which one a ray meets (`rays.cast`).
+surface is and how warm (`Scene.distance_m`, `Scene.temperature_k_at`), which one a ray meets (`rays.cast`). What moves
+stands where it is at one time; `Scene.at` gives the scene of any other.
 """
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +15,7 @@ import numpy.typing as npt
 from cairn_map.arrays import Floats, Int32s, Singles
 from cairn_map.errors import BadInputError
 from cairn_sim.scene.distance_kernels import nearest_solids
+from cairn_sim.scene.movements import CLOCK_START_S, MovingObject
 from cairn_sim.scene.solid_kernels import Shapes, second_at
 from cairn_sim.scene.solids import Box, Cylinder, Plane, Solid, Sphere
 from cairn_sim.scene.surfaces import TEMPERATURE_K, Material, Rgb
@@ -29,6 +32,12 @@ SOLIDS_MAX = 20_000
 """A solid's number fits 16 bits; and a scene file of a few lines may ask for millions."""
 BOUNDS_MARGIN_M = 1e-9 * np.array([-1, -1, -1, 1, 1, 1])
 """So that rounding never lets a ray slip past a box around a solid whose face is the box's own."""
+EMPTY_BOUNDS_M = np.array([np.inf, np.inf, np.inf, -np.inf, -np.inf, -np.inf])
+"""Bounds of a solid that is gone: as far away as can be."""
+TIMES_KEPT = 16
+"""Scenes of one time that are kept, 0.2 MB each in the building; threads that render ask for neighbouring times."""
+Tree = tuple[Floats, Int32s, Int32s]
+"""Nodes, links and leaves of `Shapes`."""
 KINDS: tuple[type, ...] = (Box, Cylinder, Sphere, Plane)
 """In the order of the kernels' kind codes."""
 
@@ -53,10 +62,11 @@ class Surfaces:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scene:
-    """Solids and what is around them; made by `scene_of`."""
+    """Solids and what is around them; made by `scene_of`. What moves is where it is at the scene's start."""
 
     name: str
     solids: tuple[Solid, ...]
+    """Those that stand still, then those of `moving`: a solid has the same number at all times."""
     shapes: Shapes
     surfaces: Surfaces
     ambient_k: float
@@ -64,6 +74,24 @@ class Scene:
     sky_k: float
     """Apparent temperature where nothing is met."""
     sky_srgb: Rgb
+    moving: tuple[MovingObject, ...] = ()
+    gone: frozenset[int] = frozenset()
+    """Numbers of the solids of moving objects that are not there at this time; they stand in `solids` all the same."""
+
+    def at(self, time_s: float) -> "Scene":
+        """The scene as it is at a time, in which nothing moves; itself if nothing ever does.
+
+        Equal for all times between which nothing changed: the same object for the times asked for last.
+
+        Args:
+            time_s: UTC, seconds since 1970, as of scans: `CLOCK_START_S` is time 0 of a scene file. Before it all is
+                as it is then.
+        """
+        if not self.moving:
+            return self
+        after_s = max(time_s - CLOCK_START_S, 0.0)
+        poses = [each.movement.pose_at(after_s) for each in self.moving]
+        return _placed_scene(self, tuple(None if T is None else T.tobytes() for T in poses))
 
     def solid_at(self, points: npt.NDArray[np.floating]) -> Int32s:
         """(...) int32, number of the solid at each (..., 3) point; -1 in free space, and for NaN."""
@@ -111,17 +139,18 @@ class Scene:
 def scene_of(
     solids: Iterable[Solid],
     *,
+    moving: Sequence[MovingObject] = (),
     name: str = "scene",
     ambient_k: float = AMBIENT_K,
     sky_k: float = AMBIENT_K,
     sky_srgb: Rgb = (0, 0, 0),
 ) -> Scene:
-    """A scene of these solids, at least one, which may touch and overlap; numbered as given.
+    """A scene of these solids, at least one, which may touch and overlap; numbered as given, what moves last.
 
     Raises:
         BadInputError: no solids, or too many.
     """
-    given = tuple(solids)
+    given = (*solids, *(solid for each in moving for solid in each.solids))
     if not 1 <= len(given) <= SOLIDS_MAX:
         raise BadInputError("bad_scene", f"a scene needs 1 to {SOLIDS_MAX} solids, got {len(given)}")
     if not all(TEMPERATURE_K[0] <= kelvin <= TEMPERATURE_K[1] for kelvin in (ambient_k, sky_k)):
@@ -130,7 +159,7 @@ def scene_of(
             f"surroundings and sky need {TEMPERATURE_K[0]} to {TEMPERATURE_K[1]} K, got {ambient_k:g} and {sky_k:g}",
         )
     pairs = [solid.surface.materials for solid in given]
-    return Scene(
+    scene = Scene(
         name=name,
         solids=given,
         shapes=_shapes(given),
@@ -145,22 +174,56 @@ def scene_of(
         ambient_k=ambient_k,
         sky_k=sky_k,
         sky_srgb=sky_srgb,
+        moving=tuple(moving),
     )
+    return scene if not moving else replace(scene.at(CLOCK_START_S), moving=scene.moving)
+
+
+@lru_cache(maxsize=TIMES_KEPT)
+def _placed_scene(scene: Scene, poses: tuple[bytes | None, ...]) -> Scene:
+    """A scene of one time; `poses` are the bytes of each moving object's `T_map_object`, None for one that is gone.
+
+    What stands still keeps its arrays and its tree: a time of the moving building takes 2 ms, making it again 35.
+    """
+    still_count = len(scene.solids) - sum(len(each.solids) for each in scene.moving)
+    solids, gone = list(scene.solids), set[int]()
+    first = still_count
+    for each, pose in zip(scene.moving, poses, strict=True):
+        numbers = range(first, first + len(each.solids))
+        if pose is None:
+            solids[numbers.start : numbers.stop], gone = each.solids, gone.union(numbers)
+        else:
+            solids[numbers.start : numbers.stop] = each.placed_solids(np.frombuffer(pose).reshape(4, 4))
+        first = numbers.stop
+    frame, bounds = scene.shapes.frame.copy(), scene.shapes.bounds.copy()
+    frame[still_count:], bounds[still_count:] = _frames(solids[still_count:]), _bounds(solids[still_count:])
+    there = [k for k in range(still_count, len(solids)) if k not in gone]
+    bounds[list(gone)] = EMPTY_BOUNDS_M
+    nodes, links, leaves = _joined_trees(_still_tree(scene, still_count), _tree(bounds, there))
+    shapes = scene.shapes._replace(frame=frame, bounds=bounds, nodes=nodes, links=links, leaves=leaves)
+    return replace(scene, solids=tuple(solids), shapes=shapes, moving=(), gone=frozenset(gone))
+
+
+@lru_cache(maxsize=TIMES_KEPT)
+def _still_tree(scene: Scene, still_count: int) -> Tree:
+    """Tree of the solids of a scene that stand still."""
+    endless = set(scene.shapes.endless.tolist())
+    return _tree(scene.shapes.bounds, [k for k in range(still_count) if k not in endless])
 
 
 def _of(pairs: Iterable[tuple[Material, Material]], field: str) -> Singles:
     return np.array([[getattr(m, field) for m in pair] for pair in pairs], dtype=np.float32)
 
 
-def _shapes(solids: tuple[Solid, ...]) -> Shapes:
+def _shapes(solids: Sequence[Solid]) -> Shapes:
     surfaces = [solid.surface for solid in solids]
     endless = [k for k, solid in enumerate(solids) if isinstance(solid.shape, Plane)]
     bounded = [k for k, solid in enumerate(solids) if not isinstance(solid.shape, Plane)]
-    bounds = np.array([np.concatenate(solid.bounds_m()) for solid in solids]) + BOUNDS_MARGIN_M
-    nodes, links, order = tree_of(bounds[bounded])
+    bounds = _bounds(solids)
+    nodes, links, leaves = _tree(bounds, bounded)
     return Shapes(
         kind=np.array([KINDS.index(type(solid.shape)) for solid in solids], dtype=np.int8),
-        frame=np.array([[*s.T_map_solid[:3, :3].T.ravel(), *s.T_map_solid[:3, 3]] for s in solids], dtype=np.float64),
+        frame=_frames(solids),
         half_m=np.array([solid.shape.half_m for solid in solids], dtype=np.float64),
         optics=np.array([surface.material.optics for surface in surfaces], dtype=np.int8),
         texture=np.array(
@@ -170,11 +233,43 @@ def _shapes(solids: tuple[Solid, ...]) -> Shapes:
         endless=np.array(endless, dtype=np.int32),
         nodes=nodes,
         links=links,
-        leaves=np.array(bounded, dtype=np.int32)[order],
+        leaves=leaves,
     )
 
 
-def tree_of(bounds_m: Floats) -> tuple[Floats, Int32s, Int32s]:
+def _frames(solids: Sequence[Solid]) -> Floats:
+    """(P, 12) of `Shapes`."""
+    return np.array([[*s.T_map_solid[:3, :3].T.ravel(), *s.T_map_solid[:3, 3]] for s in solids], dtype=np.float64)
+
+
+def _bounds(solids: Sequence[Solid]) -> Floats:
+    """(P, 6) of `Shapes`."""
+    return np.asarray(np.array([np.concatenate(solid.bounds_m()) for solid in solids]) + BOUNDS_MARGIN_M)
+
+
+def _tree(bounds_m: Floats, members: Sequence[int]) -> Tree:
+    """Tree of some of the solids, by their numbers."""
+    nodes, links, order = tree_of(bounds_m[list(members)])
+    return nodes, links, np.array(members, dtype=np.int32)[order]
+
+
+def _joined_trees(one: Tree, other: Tree) -> Tree:
+    """A root above two trees; the other one if a tree holds nothing."""
+    if not len(one[2]) or not len(other[2]):
+        return one if len(one[2]) else other
+    nodes, links = [], []
+    # Numbers move up by what stands before a tree: those of nodes in a branch's link, those of leaves in a leaf's.
+    for (own_nodes, own_links, _), nodes_before, leaves_before in ((one, 1, 0), (other, 1 + len(one[0]), len(one[2]))):
+        moved = own_links.copy()
+        moved[:, 0] += np.where(moved[:, 1] > 0, leaves_before, nodes_before).astype(np.int32)
+        nodes.append(own_nodes)
+        links.append(moved)
+    root = np.concatenate([np.minimum(one[0][0, :3], other[0][0, :3]), np.maximum(one[0][0, 3:], other[0][0, 3:])])
+    root_links = np.array([[1 + len(one[0]), 0]], dtype=np.int32)
+    return np.vstack([root, *nodes]), np.vstack([root_links, *links]), np.concatenate([one[2], other[2]])
+
+
+def tree_of(bounds_m: Floats) -> Tree:
     """Nodes, links and order of the tree over (N, 6) bounds; with no bounds, one empty leaf that no ray meets."""
     nodes: list[Floats] = []
     links: list[list[int]] = []

@@ -40,6 +40,39 @@ A solid has one of these shapes, and a `surface` that names a surface or a mater
 is put in the place of its materials'. `count` and `step_m` place an object again and again: "stool 1", "stool 2".
 A part of the object placed as "stool" is named "stool/leg". `surfaces` of a place puts other surfaces for the
 object's. No two solids share a name.
+
+What moves is an object with poses at some times, in seconds after the scene's start:
+
+    [objects.leaf]                        # its foot is the hinge
+    parts = [{name = "wood", box = [1, 0.04, 2], at = [0.5, 0, 0], surface = "tile"}]
+
+    [[moving]]                            # a door that opens after an hour
+    name = "door"
+    object = "leaf"
+    at = [2, 5, 0]
+    keyframes = [{time_s = 3600, turn_deg = 0}, {time_s = 3602, turn_deg = 85}]
+
+    [[moving]]                            # a stool that is brought after ten minutes, and taken away after an hour
+    name = "second stool"
+    object = "stool"
+    keyframes = [{time_s = 0, gone = true}, {time_s = 600, at = [3, 1, 0]}, {time_s = 3600, gone = true}]
+
+    [[moving]]                            # a cart that goes to and fro
+    name = "cart"
+    object = "stool"
+    surfaces = {tile = "grout"}
+    keyframes = [{time_s = 0, at = [1, 4, 0]}, {time_s = 5, at = [5, 4, 0]}, {time_s = 10, at = [1, 4, 0]}]
+    repeat_s = 10
+
+Between two keyframes its place runs straight and its turn along the shortest arc, less than 180 degrees; before the
+first and after the last it stays. A keyframe has `at` and `turn_deg`, zero when left out, or `gone = true`: from then
+on it is not there. They count from the `at` and `turn_deg` of the entry, which are the map's when left out.
+`repeat_s` seconds after the start all begins again with time 0. A camera's images are of the one time of their scan.
+
+    base = "building"                     # a shipped scene that this one adds to
+    without = ["lab 1 door"]              # solids, places and moving objects of it, by the names in its file
+
+A scene with a base has all that the base has, and names of its own for what it adds.
 """
 
 import tomllib
@@ -53,20 +86,32 @@ from pydantic import ValidationError
 
 from cairn_calib.rig.poses import Transform
 from cairn_map.errors import COMPLAINTS_MAX, BadInputError
+from cairn_sim.scene.movements import Keyframe, Movement, MovingObject
 from cairn_sim.scene.scene import SOLIDS_MAX, Scene, scene_of
-from cairn_sim.scene.scene_format import ZERO_C_K, PlaceEntry, SceneFile, SolidEntry, SurfaceEntry, Turn
-from cairn_sim.scene.solids import Angles3, Box, Cylinder, Metres3, Plane, Shape, Solid, Sphere, placed
+from cairn_sim.scene.scene_format import (
+    ORIGIN,
+    ZERO_C_K,
+    MovingEntry,
+    PlaceEntry,
+    SceneFile,
+    SolidEntry,
+    SurfaceEntry,
+    Turn,
+)
+from cairn_sim.scene.solids import Angles3, Box, Cylinder, Plane, Shape, Solid, Sphere, placed
 from cairn_sim.scene.surfaces import Material, Optics, Rgb, Surface
 
-SHIPPED = ("building", "small-room", "yard")
+SHIPPED = ("building", "small-room", "yard", "moving-building", "moving-yard")
 """Names of the scenes that come with cairn."""
 FILE_BYTES_MAX = 1 << 20
 DOTS_MAX = 64
 """In a line; a key of n dots takes `tomllib` n^2 memory, 160 GB for one of 200 000."""
 CAME_MAX = 80
 """Characters of what came, in an error."""
-ORIGIN: Metres3 = (0.0, 0.0, 0.0)
-UNTURNED: Angles3 = (0.0, 0.0, 0.0)
+OF_BASE = ("materials", "surfaces", "objects", "areas")
+"""Tables that a scene has from its base, and adds to."""
+LIGHT = ("ambient_c", "sky_c", "sky")
+"""Fields that it has from its base unless it says otherwise."""
 
 
 def load_scene(name_or_path: str | Path) -> Scene:
@@ -106,6 +151,21 @@ def scene_from_toml(text: str, *, source: str = "scene") -> Scene:
     Raises:
         BadInputError: not TOML, too large, or not a scene; says which field, what it should be and what it is.
     """
+    written = _written(text, source)
+    expansion = _Expansion(written, source)
+    still = tuple(expansion.solids())
+    return scene_of(
+        still,
+        moving=expansion.moving(),
+        name=written.name,
+        ambient_k=written.ambient_c + ZERO_C_K,
+        sky_k=(written.ambient_c if written.sky_c is None else written.sky_c) + ZERO_C_K,
+        sky_srgb=_rgb(written.sky),
+    )
+
+
+def _written(text: str, source: str) -> SceneFile:
+    """The entries of a text, and those of its base."""
     if len(text) > FILE_BYTES_MAX:
         raise _bad(source, f"expected at most {FILE_BYTES_MAX} characters, got {len(text)}")
     if max(line.count(".") for line in text.split("\n")) > DOTS_MAX:
@@ -116,13 +176,43 @@ def scene_from_toml(text: str, *, source: str = "scene") -> Scene:
         raise _bad(source, _complaint(exc)) from exc
     except (ValueError, RecursionError) as exc:  # ValueError: TOMLDecodeError, and numbers of too many digits.
         raise _bad(source, f"expected TOML: {exc}") from exc
-    return scene_of(
-        _Expansion(written, source).solids(),
-        name=written.name,
-        ambient_k=written.ambient_c + ZERO_C_K,
-        sky_k=(written.ambient_c if written.sky_c is None else written.sky_c) + ZERO_C_K,
-        sky_srgb=_rgb(written.sky),
-    )
+    if written.base is None:
+        if written.without:
+            raise _bad(source, "without: expected a base from which to leave things out, got none")
+        return written
+    if written.base not in SHIPPED:
+        raise _bad(source, f"base: expected one of {', '.join(SHIPPED)}, got {written.base!r}")
+    return _on_base(written, _written(shipped_text(written.base), written.base), source)
+
+
+def _on_base(own: SceneFile, base: SceneFile, source: str) -> SceneFile:
+    """A scene's entries and those of its base, which come first."""
+    fields: dict[str, object] = {"name": own.name, "note": own.note}
+    fields |= {light: getattr(own, light) for light in LIGHT if light in own.model_fields_set}
+    kept = _left(base, own.without, source)
+    for title in OF_BASE:
+        added, given = getattr(own, title), getattr(kept, title)
+        for name in added:
+            if name in given:
+                raise _bad(source, f"{title}.{name}: expected a name that {base.name} does not have, got {name!r}")
+        fields[title] = given | added
+    return kept.model_copy(update=fields | {"moving": (*kept.moving, *own.moving)})
+
+
+def _left(base: SceneFile, without: tuple[str, ...], source: str) -> SceneFile:
+    """A scene's entries but for some solids, places and moving objects."""
+    known = {each.name for each in base.moving}
+    areas = {}
+    for title, area in base.areas.items():
+        known |= {solid.name for solid in area.solids} | {place.name for place in area.places}
+        solids = tuple(solid for solid in area.solids if solid.name not in without)
+        places = tuple(place for place in area.places if place.name not in without)
+        areas[title] = area.model_copy(update={"solids": solids, "places": places})
+    for number, name in enumerate(without):
+        if name not in known:
+            raise _bad(source, f"without.{number}: expected a name that stands in {base.name}, got {name!r}")
+    moving = tuple(each for each in base.moving if each.name not in without)
+    return base.model_copy(update={"areas": areas, "moving": moving})
 
 
 class _Expansion:
@@ -147,6 +237,22 @@ class _Expansion:
             for n, place in enumerate(area.places):
                 yield from self._placed(place, f"areas.{title}.places.{n}")
 
+    def moving(self) -> list[MovingObject]:
+        """All objects that move; to be asked after `solids`, whose names they may not have.
+
+        Raises:
+            BadInputError: a name that is not there or twice there, or a movement that is none.
+        """
+        found = []
+        for n, entry in enumerate(self.written.moving):
+            where = f"moving.{n}"
+            solids = tuple(self._parts(entry, where, entry.name, np.eye(4)))
+            try:
+                found.append(MovingObject(entry.name, solids, _movement(entry)))
+            except BadInputError as exc:
+                raise _bad(self.source, f"{where}: {exc.message}") from exc
+        return found
+
     def _check_count(self) -> None:
         count = 0
         for title, area in self.written.areas.items():
@@ -154,22 +260,28 @@ class _Expansion:
             for n, place in enumerate(area.places):
                 self._check_known(f"areas.{title}.places.{n}.object", place.object, self.written.objects)
                 count += place.count * len(self.written.objects[place.object].parts)
+        for n, entry in enumerate(self.written.moving):
+            self._check_known(f"moving.{n}.object", entry.object, self.written.objects)
+            count += len(self.written.objects[entry.object].parts)
         if not 1 <= count <= SOLIDS_MAX:
             raise _bad(self.source, f"areas: expected 1 to {SOLIDS_MAX} solids in all, got {count}")
 
     def _placed(self, place: PlaceEntry, where: str) -> Iterator[Solid]:
-        own = {part.surface: part for part in self.written.objects[place.object].parts}
-        for old, new in place.surfaces.items():
-            self._check_known(f"{where}.surfaces", old, own)
-            self._check_known(f"{where}.surfaces.{old}", new, self.surfaces)
         turn_rad = _turn_rad(place.turn_deg)
         for n in range(place.count):
             x, y, z = (a + n * step for a, step in zip(place.at, place.step_m, strict=True))
-            T_map_object = placed((x, y, z), turn_rad)
             name = place.name if place.count == 1 else f"{place.name} {n + 1}"
-            for k, part in enumerate(self.written.objects[place.object].parts):
-                at = f"objects.{place.object}.parts.{k}"
-                yield self._solid(part, at, f"{name}/{part.name}", T_map_object, place.surfaces)
+            yield from self._parts(place, where, name, placed((x, y, z), turn_rad))
+
+    def _parts(self, entry: PlaceEntry | MovingEntry, where: str, name: str, T: Transform) -> Iterator[Solid]:
+        """The solids of an entry's object, at a pose."""
+        parts = self.written.objects[entry.object].parts
+        own = {part.surface: part for part in parts}
+        for old, new in entry.surfaces.items():
+            self._check_known(f"{where}.surfaces", old, own)
+            self._check_known(f"{where}.surfaces.{old}", new, self.surfaces)
+        for k, part in enumerate(parts):
+            yield self._solid(part, f"objects.{entry.object}.parts.{k}", f"{name}/{part.name}", T, entry.surfaces)
 
     def _solid(self, entry: SolidEntry, where: str, name: str, T: Transform, other: Mapping[str, str]) -> Solid:
         if name in self.names:
@@ -238,13 +350,22 @@ def _shape(entry: SolidEntry) -> tuple[Shape, Transform]:
         T = np.eye(4)
         T[:3, 3] = (low + high) / 2
         return Box((x, y, z)), T
-    T = placed(entry.at or ORIGIN, _turn_rad(entry.turn_deg or UNTURNED))
+    T = placed(entry.at or ORIGIN, _turn_rad(entry.turn_deg or ORIGIN))
     if entry.box is not None:
         return Box(entry.box), T @ placed((0.0, 0.0, entry.box[2] / 2))
     if entry.cylinder is not None:
         radius_m, height_m = entry.cylinder
         return Cylinder(radius_m, height_m), T @ placed((0.0, 0.0, height_m / 2))
     return (Plane() if entry.sphere is None else Sphere(entry.sphere)), T
+
+
+def _movement(entry: MovingEntry) -> Movement:
+    """The movement of an entry."""
+    keyframes = [
+        Keyframe(each.time_s, None if each.gone else placed(each.at, _turn_rad(each.turn_deg)))
+        for each in entry.keyframes
+    ]
+    return Movement(tuple(keyframes), placed(entry.at, _turn_rad(entry.turn_deg)), entry.repeat_s)
 
 
 def _turn_rad(turn_deg: Turn) -> Angles3:

@@ -1,6 +1,7 @@
 """Schema of a scene file, field by field; `scene_file` states the rules in words, and makes solids of the entries."""
 
 import math
+from itertools import pairwise
 from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, FailFast, Field, model_validator
@@ -18,12 +19,15 @@ Size = Annotated[float, Field(strict=True, ge=1e-4, le=1e6)]
 Period = Annotated[float, Field(strict=True, ge=1e-3)]
 """May be infinite."""
 Degrees = Annotated[float, Field(strict=True, ge=-360, le=360)]
+Seconds = Annotated[float, Field(strict=True, ge=0, le=1e9)]
 Turn = Annotated[
     tuple[Degrees, Degrees, Degrees],
     BeforeValidator(lambda turn: turn if isinstance(turn, list | tuple) else (0.0, 0.0, turn)),
 ]
 """A single angle is about z."""
 At = tuple[Metres, Metres, Metres]
+ORIGIN: tuple[float, float, float] = (0.0, 0.0, 0.0)
+HALF_TURN_DEG = 180.0
 STRICT = ConfigDict(frozen=True, extra="forbid")
 
 
@@ -103,10 +107,10 @@ class PlaceEntry(BaseModel):
     object: Name
     name: Name
     at: At
-    turn_deg: Turn = (0.0, 0.0, 0.0)
+    turn_deg: Turn = ORIGIN
     surfaces: dict[Name, Name] = Field(default_factory=dict)
     count: Annotated[int, Field(strict=True, ge=1, le=SOLIDS_MAX)] = 1
-    step_m: At = (0.0, 0.0, 0.0)
+    step_m: At = ORIGIN
 
 
 class AreaEntry(BaseModel):
@@ -118,6 +122,48 @@ class AreaEntry(BaseModel):
     places: Annotated[tuple[PlaceEntry, ...], FailFast()] = ()
 
 
+class KeyframeEntry(BaseModel):
+    """`movements.Keyframe` as written."""
+
+    model_config = STRICT
+
+    time_s: Seconds
+    at: At = ORIGIN
+    turn_deg: Turn = ORIGIN
+    gone: Literal[True] | None = None
+
+    @model_validator(mode="after")
+    def _somewhere_or_gone(self) -> Self:
+        if self.gone and self.model_fields_set & {"at", "turn_deg"}:
+            raise ValueError("expected no at and no turn_deg with gone: what is gone is nowhere")
+        return self
+
+
+class MovingEntry(BaseModel):
+    """An object that moves: `movements.MovingObject` as written."""
+
+    model_config = STRICT
+
+    name: Name
+    object: Name
+    at: At = ORIGIN
+    turn_deg: Turn = ORIGIN
+    surfaces: dict[Name, Name] = Field(default_factory=dict)
+    keyframes: Annotated[tuple[KeyframeEntry, ...], Field(min_length=1), FailFast()]
+    repeat_s: Annotated[float, Field(strict=True, gt=0, le=1e9)] | None = None
+
+    @model_validator(mode="after")
+    def _short_turns(self) -> Self:
+        for number, (one, other) in enumerate(pairwise(self.keyframes)):
+            turn_deg = max(abs(b - a) for a, b in zip(one.turn_deg, other.turn_deg, strict=True))
+            if not (one.gone or other.gone) and turn_deg >= HALF_TURN_DEG:
+                raise ValueError(
+                    f"expected less than {HALF_TURN_DEG:g} degrees from keyframe to keyframe, as the shorter way is "
+                    f"taken, got {turn_deg:g} from {number} to {number + 1}; put one between"
+                )
+        return self
+
+
 class SceneFile(BaseModel):
     """A scene as written."""
 
@@ -127,10 +173,13 @@ class SceneFile(BaseModel):
     version: Annotated[int, Field(strict=True, ge=1, le=1)]
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
     note: Annotated[str, Field(max_length=4096)] = ""
+    base: Name | None = None
+    without: tuple[Name, ...] = ()
     ambient_c: Celsius = 20.0
     sky_c: Celsius | None = None
     sky: Colour = "#000000"
-    materials: dict[Name, MaterialEntry]
+    materials: dict[Name, MaterialEntry] = Field(default_factory=dict)
     surfaces: dict[Name, SurfaceEntry] = Field(default_factory=dict)
     objects: dict[Name, ObjectEntry] = Field(default_factory=dict)
-    areas: dict[Name, AreaEntry]
+    areas: dict[Name, AreaEntry] = Field(default_factory=dict)
+    moving: Annotated[tuple[MovingEntry, ...], FailFast()] = ()

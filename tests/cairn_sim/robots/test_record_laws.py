@@ -3,8 +3,10 @@
 What these tests do not show: that the noise is right; test_sensors.py does.
 """
 
+import json
 import math
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -14,12 +16,15 @@ from cairn_calib.rig.poses import Transform, look_at, transform_points
 from cairn_fusion.recording.recording import open_recording
 from cairn_fusion.recording.trajectory import read_trajectory
 from cairn_map.arrays import Floats
+from cairn_map.errors import BadInputError
+from cairn_sim.render.render import render_scan
 from cairn_sim.render.truth import camera_truth
 from cairn_sim.robots.heads import RANGE_CAMERA, full_head, tof_head
-from cairn_sim.robots.record import CLOCK_START_S, Plan, record, shots_of
+from cairn_sim.robots.record import Plan, record, shots_of
 from cairn_sim.robots.robots import LIDAR, ROBOTS
+from cairn_sim.scene.movements import CLOCK_START_S
 from cairn_sim.scene.scene import scene_of
-from cairn_sim.scene.scene_file import load_scene, shipped_text
+from cairn_sim.scene.scene_file import load_scene, scene_from_toml, shipped_text
 from cairn_sim.scene.solids import Box, Solid, placed
 from cairn_sim.scene.surfaces import Material, Optics, Surface
 from cairn_sim.sim_command import main
@@ -90,6 +95,97 @@ def test_times_of_a_part_are_those_of_the_whole_and_rise_everywhere() -> None:
         ]
         assert (np.diff(whole) > 0).all()
 
+
+def test_rounds_go_the_same_way_again_at_the_next_times() -> None:
+    plan = Plan(scene=ROOM, robot=ROBOTS["tof"], path="west", last_stop=2)
+    once, thrice = shots_of(plan), shots_of(replace(plan, rounds=3))
+    assert len(thrice) == 3 * len(once) == 3 * 72
+    for number, shot in enumerate(thrice):
+        np.testing.assert_array_equal(shot.T_map_rig, once[number % 72].T_map_rig)
+        assert (shot.stop, shot.scan) == (once[number % 72].stop, once[number % 72].scan)
+    assert len({shot.number for shot in thrice}) == len(thrice)
+    # A round of all 8 stops takes 144 s, whichever of them are recorded.
+    assert {b.time_s - a.time_s for a, b in zip(once, thrice[72:], strict=False)} == {144.0}
+
+
+def test_a_recording_of_hours_visits_its_stops_at_even_times() -> None:
+    plan = Plan(scene=ROOM, robot=ROBOTS["tof"], path="west", rounds=5, lasts_s=7200.0)
+    shots = shots_of(plan)
+    first = [shot.time_s - CLOCK_START_S for shot in shots if shot.scan == 0]
+    np.testing.assert_allclose(first, np.arange(40) * 180.0)
+    for a, b in pairwise(shots):
+        if b.scan:
+            assert b.time_s - a.time_s == pytest.approx(0.5)
+    assert sum(shot.ends_stop for shot in shots) == 40
+
+
+def test_rounds_of_a_drive_are_spread_over_the_time() -> None:
+    plan = Plan(scene=ROOM, robot=ROBOTS["tof"], path="west", speed_m_s=0.5, rate_hz=2.0, rounds=2, lasts_s=600.0)
+    times_s = np.array([shot.time_s for shot in shots_of(plan)]) - CLOCK_START_S
+    gaps_s = np.diff(times_s)
+    half = len(times_s) // 2
+    assert times_s[half] == pytest.approx(300)
+    np.testing.assert_allclose(np.delete(gaps_s, half - 1), 0.5)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"rounds": 0}, "at least 1 round"),
+        ({"lasts_s": -1.0}, "a time from 0 s"),
+        ({"lasts_s": math.nan}, "a time from 0 s"),
+        ({"lasts_s": 100.0}, "288 scans take 0.04 h at least, got 0.028 h"),
+        ({"rounds": 1000}, "at most 200000 scans, got 1000 rounds of 288"),
+    ],
+)
+def test_rounds_and_hours_that_cannot_be_are_refused(changes: dict[str, float], words: str) -> None:
+    with pytest.raises(BadInputError, match=words) as caught:
+        shots_of(replace(Plan(scene=ROOM, robot=ROBOTS["tof"], path="west"), **changes))  # type: ignore[arg-type]
+    assert caught.value.kind == "bad_plan"
+
+
+def test_each_scan_of_a_recording_shows_its_own_time_and_so_does_its_truth(tmp_path: Path) -> None:
+    scene = scene_from_toml(MOVING)
+    plan = Plan(
+        scene=replace(scene, name="small-room"),
+        robot=replace(ROBOTS["tof"], scans=(2, 1)),
+        path="west",
+        perfect=True,
+        rounds=2,
+        lasts_s=7200.0,
+        last_stop=1,
+    )
+    shots = list(record(plan, tmp_path / "rec", scene_text=MOVING))
+    recording = open_recording(tmp_path / "rec")
+    assert [recording.scan(n).time_s for n in range(4)] == [shot.time_s for shot in shots]
+    for index, shot in enumerate(shots):
+        now, rig = scene.at(shot.time_s), plan.robot.rig_of(1.0)
+        expected = camera_truth(now, rig, RANGE_CAMERA, T_map_rig=shot.T_map_rig)
+        truth = np.load(tmp_path / "rec" / "truth" / RANGE_CAMERA / f"{index:06d}.npz")
+        np.testing.assert_array_equal(truth["range_m"], expected.range_m)
+        seen = render_scan(now, rig, T_map_rig=shot.T_map_rig, range_camera=RANGE_CAMERA, time_s=shot.time_s)
+        np.testing.assert_allclose(recording.scan(index).range_m, seen.range_m, atol=6e-4)
+    screen = scene.number_of("screen/sheet")
+    hit = [(np.load(tmp_path / "rec/truth/tof" / f"{n:06d}.npz")["solid"] == screen).any() for n in range(4)]
+    assert not any(hit[:2]) and any(hit[2:]), "the screen comes after half an hour"
+    names = json.loads((tmp_path / "rec" / "truth" / "truth.json").read_text())["solids"]
+    assert names[screen] == "screen/sheet"
+
+
+MOVING = """
+format = "cairn-scene"
+version = 1
+name = "mine"
+base = "small-room"
+[materials]
+cloth = {colour = "#804040"}
+[objects.screen]
+parts = [{name = "sheet", box = [0.1, 1.6, 1.6], surface = "cloth"}]
+[[moving]]
+name = "screen"
+object = "screen"
+keyframes = [{time_s = 0, gone = true}, {time_s = 1800, at = [0.9, 2.4, 0.4], turn_deg = 90}]
+"""
 
 WARM, COLD = Material(temperature_k=330.0), Material(temperature_k=270.0)
 PERIOD_M, PHASE_M = np.array([0.31, 0.23]), np.array([0.04, -0.07])

@@ -12,6 +12,7 @@ from cairn_sim.robots.heads import RANGE_CAMERA, full_head, handheld_head, lidar
 from cairn_sim.robots.kinematics import Joints, Manipulator, measurement_joints, with_backlash
 from cairn_sim.robots.robots import ROBOTS, robot_named
 from cairn_sim.robots.trajectories import PATHS, PoseErrors, believed, drive, path_names, stops
+from cairn_sim.scene.movements import CLOCK_START_S
 from cairn_sim.scene.scene_file import SHIPPED, load_scene
 
 BODY_M = 0.35
@@ -119,6 +120,17 @@ def test_stops_and_drives_are_clear_of_everything_but_the_ground(scene_name: str
         for T in standing:
             check_transform(T)
             assert scene.distance_m(T[:3, 3]) == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.parametrize("scene_name", [name for name in SHIPPED if load_scene(name).moving])
+def test_what_moves_keeps_clear_of_all_paths_at_all_times(scene_name: str) -> None:
+    scene = load_scene(scene_name)
+    poses = [T for path in PATHS[scene_name] for T in drive(scene, path, speed_m_s=0.5, rate_hz=5)]
+    heights_m = np.linspace(BODY_M + 0.05, 1.1, 6)
+    at = np.array([(T @ [0, 0, height_m, 1])[:3] for T in poses for height_m in heights_m])
+    keyframes_s = {key.time_s for each in scene.moving for key in each.movement.keyframes}
+    for after_s in sorted(keyframes_s | {float(s) for s in range(24)} | {1801.0, 1802.0, 1803.0, 3601.0, 3602.0}):
+        assert scene.at(CLOCK_START_S + after_s).distance_m(at).min() > BODY_M - 0.05, after_s
 
 
 def test_the_papers_experiment_has_its_54_stops_as_far_apart_as_printed() -> None:

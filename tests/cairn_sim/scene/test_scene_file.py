@@ -168,6 +168,14 @@ def place(fields: str) -> str:
     return HEAD + MATERIALS + OBJECT + f"[areas.hall]\nplaces = [{{{fields}}}]\n"
 
 
+def moving(fields: str) -> str:
+    return solid(BALL) + f"[[moving]]\nname = 'cart'\nobject = 'stool'\n{fields}\n"
+
+
+def based(fields: str) -> str:
+    return f"format = 'cairn-scene'\nversion = 1\nname = 'mine'\n{fields}\n"
+
+
 BALL = "name = 'a', surface = 'plain', sphere = 1"
 WRONG: dict[str, tuple[str, list[str]]] = {
     "no TOML": ("format = ", ["mine.toml", "TOML"]),
@@ -233,6 +241,66 @@ WRONG: dict[str, tuple[str, list[str]]] = {
     "no parts": (solid(BALL) + "[objects.none]\nparts = []", ["objects.none.parts"]),
     "no count": (place("object = 'stool', name = 'a', at = [0, 0, 0], count = 0"), ["places.0.count", "got 0"]),
     "too many solids": (place("object = 'stool', name = 'a', at = [0, 0, 0], count = 10001"), ["areas", "20002"]),
+    "no keyframes": (moving("keyframes = []"), ["moving.0.keyframes"]),
+    "keyframe without time": (moving("keyframes = [{at = [0, 0, 0]}]"), ["moving.0.keyframes.0.time_s", "required"]),
+    "time before the start": (
+        moving("keyframes = [{time_s = -1}]"),
+        ["moving.0.keyframes.0.time_s", "greater than or equal to 0", "got -1"],
+    ),
+    "time as text": (moving("keyframes = [{time_s = '1'}]"), ["moving.0.keyframes.0.time_s", "got '1'"]),
+    "endless time": (moving("keyframes = [{time_s = inf}]"), ["moving.0.keyframes.0.time_s", "got inf"]),
+    "times that fall": (
+        moving("keyframes = [{time_s = 20}, {time_s = 10}]"),
+        ["moving.0", "times of keyframes must rise", "got 10 after 20"],
+    ),
+    "times that stay": (moving("keyframes = [{time_s = 20}, {time_s = 20}]"), ["moving.0", "must rise"]),
+    "half a turn": (
+        moving("keyframes = [{time_s = 0, turn_deg = -90}, {time_s = 10, turn_deg = 90}]"),
+        ["moving.0", "less than 180 degrees", "got 180 from 0 to 1", "put one between"],
+    ),
+    "gone and somewhere": (
+        moving("keyframes = [{time_s = 0, gone = true, at = [0, 0, 1]}]"),
+        ["moving.0.keyframes.0", "what is gone is nowhere"],
+    ),
+    "gone false": (moving("keyframes = [{time_s = 0, gone = false}]"), ["moving.0.keyframes.0.gone", "got False"]),
+    "short period": (
+        moving("repeat_s = 5\nkeyframes = [{time_s = 0}, {time_s = 10}]"),
+        ["moving.0", "repeat_s", "last keyframe's 10 s", "got 5"],
+    ),
+    "no period": (moving("repeat_s = 0\nkeyframes = [{time_s = 0}]"), ["moving.0.repeat_s", "got 0"]),
+    "unknown field of a movement": (moving("speed = 3\nkeyframes = [{time_s = 0}]"), ["moving.0.speed", "got 3"]),
+    "moving unknown object": (
+        moving("keyframes = [{time_s = 0}]").replace("'stool'", "'throne'"),
+        ["moving.0.object", "stool", "'throne'"],
+    ),
+    "moving unknown surface": (
+        moving("surfaces = {gold = 'wall'}\nkeyframes = [{time_s = 0}]"),
+        ["moving.0.surfaces", "plain, wall", "'gold'"],
+    ),
+    "moving name twice": (
+        moving("keyframes = [{time_s = 0}]")
+        + "[[moving]]\nname = 'cart'\nobject = 'stool'\nkeyframes = [{time_s = 0}]",
+        ["objects.stool.parts.0.name", "'cart/seat'"],
+    ),
+    "a plane that moves": (
+        moving("keyframes = [{time_s = 0}]").replace("cylinder = [0.05, 0.5]", "plane = true"),
+        ["moving.0", "cart/leg is a plane", "cannot move"],
+    ),
+    "unknown base": (based("base = 'castle'"), ["base", "building, small-room", "'castle'"]),
+    "a path as base": (based("base = '../building'"), ["base", "'../building'"]),
+    "unknown in the base": (
+        based("base = 'small-room'\nwithout = ['torso', 'throne']"),
+        ["without.1", "small-room", "'throne'"],
+    ),
+    "without a base": (solid(BALL).replace("[materials]", "without = ['a']\n[materials]"), ["without", "base"]),
+    "a name of the base": (
+        based("base = 'yard'\n[materials]\ngrass = {colour = '#808080'}"),
+        ["materials.grass", "yard does not have"],
+    ),
+    "a solid of the base": (
+        based("base = 'yard'\n[areas.mine]\nsolids = [{name = 'lamp', surface = 'grass', sphere = 1}]"),
+        ["areas.mine.solids.0.name", "'lamp'"],
+    ),
     "key of many parts": ("a." * 200_000 + "b = 1", ["64 dots"]),
     "too large": ("#" * (FILE_BYTES_MAX + 1), ["mine.toml", "1048576"]),
 }
@@ -284,12 +352,52 @@ def test_shipped_scenes_load_and_bear_their_name(name: str) -> None:
     assert found.shapes.frame.shape == (len(found.solids), 12)
 
 
+def example(first: str, last: str) -> str:
+    """Lines of the documentation, from one to another."""
+    lines = [line.strip() for line in str(scene_file.__doc__).splitlines()]
+    start = next(n for n, line in enumerate(lines) if line.startswith(first))
+    end = next(n for n, line in enumerate(lines) if n >= start and line.startswith(last))
+    return "\n".join(lines[start : end + 1]) + "\n"
+
+
 def test_example_of_the_documentation_loads() -> None:
-    lines = str(scene_file.__doc__).splitlines()
-    start = next(n for n, line in enumerate(lines) if "format =" in line)
-    end = next(n for n, line in enumerate(lines) if "places =" in line)
-    names = [solid.name for solid in scene_from_toml("\n".join(line.strip() for line in lines[start : end + 1])).solids]
+    names = [solid.name for solid in scene_from_toml(example("format =", "places =")).solids]
     assert names == ["floor", "stool/seat", "stool/leg"]
+
+
+def test_moving_examples_of_the_documentation_load() -> None:
+    found = scene_from_toml(example("format =", "places =") + example("[objects.leaf]", "repeat_s ="))
+    assert [each.name for each in found.moving] == ["door", "second stool", "cart"]
+    assert found.solids[found.number_of("cart/seat")].surface.material.colour_srgb == (0x69, 0x64, 0x5F)
+
+
+def test_base_of_the_documentation_loads() -> None:
+    found = scene_from_toml("format = 'cairn-scene'\nversion = 1\nname = 'mine'\n" + example("base =", "without ="))
+    assert "lab 1 door/leaf" not in {solid.name for solid in found.solids}
+
+
+def test_a_scene_has_all_of_its_base_but_what_it_leaves_out() -> None:
+    room, mine = load_scene("small-room"), scene_from_toml(based("base = 'small-room'\nwithout = ['torso']"))
+    assert (mine.name, mine.ambient_k, mine.sky_k) == ("mine", room.ambient_k, room.sky_k)
+    assert [solid.name for solid in mine.solids] == [solid.name for solid in room.solids if solid.name != "torso"]
+
+
+def test_a_scene_adds_to_its_base_and_may_have_another_sky() -> None:
+    text = "base = 'yard'\nsky_c = 3\n[areas.mine]\nplaces = [{object = 'barrel', name = 'keg', at = [0, 0, 9]}]"
+    yard, mine = load_scene("yard"), scene_from_toml(based(text))
+    assert [solid.name for solid in mine.solids[len(yard.solids) :]] == [
+        "keg/drum",
+        "keg/hoop 1",
+        "keg/hoop 2",
+        "keg/bung",
+    ]
+    assert (mine.sky_k, mine.sky_srgb) == (pytest.approx(276.15), yard.sky_srgb)
+
+
+def test_a_base_may_move_and_be_left_still() -> None:
+    assert [each.name for each in scene_from_toml(based("base = 'moving-yard'\nwithout = ['car']")).moving] == [
+        "walker"
+    ]
 
 
 def test_boxes_of_the_file_are_boxes() -> None:
