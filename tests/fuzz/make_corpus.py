@@ -100,6 +100,20 @@ places = [
   {object = "stool", name = "row", at = [3, 1, 0], count = 2, step_m = [1, 0, 0]},
 ]
 """
+MOVING = """[[moving]]
+name = "cart"
+object = "stool"
+at = [1, 1, 0]
+keyframes = [{time_s = 0, gone = true}, {time_s = 5, at = [1, 0, 0], turn_deg = 30}, {time_s = 10.5}]
+repeat_s = 20
+"""
+BASED = """format = "cairn-scene"
+version = 1
+name = "mine"
+base = "moving-yard"
+without = ["shed", "car"]
+sky = "#102030"
+"""
 
 
 def seeds() -> Iterator[tuple[str, str, bytes]]:
@@ -119,6 +133,8 @@ def seeds() -> Iterator[tuple[str, str, bytes]]:
     yield "rig", "lidar", LIDAR.to_json()
     yield "map-head", "standard", FolderHead(geometry=SMALL).model_dump_json().encode()
     yield "scene", "office", SCENE.encode()
+    yield "scene", "moving", (SCENE + MOVING).encode()
+    yield "scene", "based", BASED.encode()
     poses = [(0.0, np.eye(4)), (0.5, np.diag([1.0, -1.0, -1.0, 1.0]))]
     yield "trajectory", "two-poses", b"# made\n" + b"".join(trajectory_line(*pose).encode() for pose in poses)
     yield "recording", "two-scans", _recording()

@@ -5,9 +5,10 @@
     all equal: server, scout, mole and late hold the same 12 cells, byte for byte
 
 It starts a server on a free port of this machine, lets three robots with different cameras drive through a
-simulated building (one of them loses its link for a while, one joins late and is low-end), shows who has what, compares
-every cell of every map, takes one commit out again and compares with a map that never had it. The result lies in
-./demo: map.ply for a point cloud viewer, map.png to look at, and the server's data to serve again.
+simulated building in which a door opens and people come and go (one robot loses its link for a while, one joins late
+and is low-end), shows who has what, compares every cell of every map, takes one commit out again and compares with a
+map that never had it. The result lies in ./demo: map.ply for a point cloud viewer, map.png to look at, and the server's
+data to serve again.
 """
 
 import argparse
@@ -43,7 +44,7 @@ from cairn_sim.demo.check import (
     server_identity,
     wait_for_fold,
 )
-from cairn_sim.demo.robot import DemoDrive, DemoRobot
+from cairn_sim.demo.robot import STOP_S, DemoDrive, DemoRobot
 from cairn_sim.robots.heads import colour_and_tof_head, full_head, thermal_and_tof_head
 from cairn_sim.robots.trajectories import stops
 from cairn_sim.scene.scene import Scene
@@ -100,12 +101,14 @@ def main(argv: list[str]) -> int:
         console.print(f"server on {url}, its data in {args.output / 'server'}")
         api = MapApi(url)
         api.create_map(MAP, CreateMap(geometry=geometry_for(voxel_edge_m=args.voxel)))
-        scene = load_scene("building")
+        scene = load_scene("moving-building")
         map_url = f"{url}/maps/{MAP}"
         chosen = [replace(plan, scans=QUICK_SCANS) if args.quick else plan for plan in plans(scene)]
         team = [DemoRobot(plan, scene, map_url, args.output / "robots", args.seed + n) for n, plan in enumerate(chosen)]
         for member in team:
             console.print(f"  {member.plan.name}: {member.plan.head}; {member.plan.mode}, {member.stop_count} stops")
+        moving = ", ".join(each.name for each in scene.moving)
+        console.print(f"  in the building move: {moving}; stops are {STOP_S:.0f} s apart")
         try:
             _drive(team, api, console)
             _check(team, api, console)

@@ -19,6 +19,9 @@ from cairn_sim.robots.record import SCAN_S
 from cairn_sim.scene.movements import CLOCK_START_S
 from cairn_sim.scene.scene import Scene
 
+STOP_S = 1000.0
+"""From one stop to the next in the scene's time, which passes at once: one robot sees a door closed, then open."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DemoDrive:
@@ -104,7 +107,7 @@ class DemoRobot:
                     self.plan.rig,
                     T_map_rig=T_map_robot @ Manipulator().T_robot_rig(joint),
                     range_camera=RANGE_CAMERA,
-                    time_s=CLOCK_START_S + number * SCAN_S,
+                    time_s=CLOCK_START_S + stop * STOP_S + scan * SCAN_S,
                     noise=self._noise,
                     number=number,
                     threads=1,
