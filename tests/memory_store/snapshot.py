@@ -55,6 +55,9 @@ class MemorySnapshot:
         for cell in islice((cell for cell in found if _is_in(box, cell)), limit):
             yield replace(cell, body=b"", stamps=b"")
 
+    def hold_cells(self, keys: Collection[CellKey]) -> None:
+        """Nothing: they are in memory."""
+
     def cells_of(self, keys: Collection[CellKey]) -> list[CellRow]:
         """Those of these cells that are stored, without their bodies, by rising number."""
         found = (self._state.cells[key] for key in sorted(keys) if key in self._state.cells)

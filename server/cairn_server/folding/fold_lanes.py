@@ -125,6 +125,8 @@ class FoldLanes:
         self, row: MapRow, commits: Sequence[StoredCommit], cache: CellCache, snapshot: Snapshot
     ) -> list[StoredCommit]:
         """Those of a map's pending commits that may be folded now; the costly ones are remembered for `plan_next`."""
+        # They are weighed here, and folded on the same state.
+        snapshot.hold_cells([key for commit in commits for key in commit.diff if key not in cache])
         weighing = _Weighing(snapshot, decoding_of(snapshot, cache))
         self._costly = {}
         found: list[StoredCommit] = []

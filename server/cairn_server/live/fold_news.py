@@ -35,6 +35,13 @@ class FoldNews:
             self._is_any = False
             return found
 
+    def take_of(self, numbers: frozenset[int]) -> frozenset[int]:
+        """Those of these maps that were folded, or may have been, since they were last taken."""
+        with self._lock:
+            found = numbers if self._is_any else numbers & self._numbers
+            self._numbers -= found
+            return found
+
     def put_back(self, found: frozenset[int] | None) -> None:
         """Take back what was taken and could not be looked at."""
         with self._lock:

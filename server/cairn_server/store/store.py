@@ -64,6 +64,10 @@ class Snapshot(Protocol):
         """One cell with its body."""
         ...
 
+    def hold_cells(self, keys: Collection[CellKey]) -> None:
+        """Read some of these cells at once, if a store does better so, for `cell` to find them in memory."""
+        ...
+
     def cells(
         self, *, after_seq: int = -1, after_key: int = -1, limit: int | None = None, box: Box | None = None
     ) -> Iterator[CellRow]:

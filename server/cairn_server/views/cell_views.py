@@ -9,6 +9,7 @@ import hashlib
 import json
 import struct
 import threading
+import time
 from collections import OrderedDict
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -30,6 +31,8 @@ BYTES_MAX = 1 << 26
 """Most bytes of all views kept; 56 cells of 4 cm have 2 MB of views at their voxels, 3 MB at all depths."""
 DEPTHS_ABOVE_VOXELS = 3
 """Depth above the voxels of the views that pages ask for first: COARSE in console/src/scene/detail.ts."""
+LOOKED_AT_S = 600.0
+"""Time for which a map counts as looked at, after a page asked for a view of it."""
 FILE_VOXELS_MAX = 1 << 20
 """Known voxels of a cell that is made into an NPZ or PLY file: some 330 bytes of memory each."""
 BUNDLE_MEDIA_TYPE = "application/vnd.cairn.views"
@@ -92,8 +95,27 @@ class ViewCache:
         self._lock = threading.Lock()
         self._views: OrderedDict[str, bytes] = OrderedDict()
         self._size_bytes = 0
+        self._looks_s: dict[int, float] = {}
+        """By the number of a map: steady time at which a page asked for a view of it last."""
         self.made = 0
         """Count of the views put in."""
+
+    def note_look(self, number: int) -> None:
+        """Note that a page asks for views of a map."""
+        with self._lock:
+            self._looks_s[number] = time.monotonic()
+
+    def looked_at(self) -> frozenset[int]:
+        """Numbers of the maps that pages looked at of late."""
+        since_s = time.monotonic() - LOOKED_AT_S
+        with self._lock:
+            self._looks_s = {number: look_s for number, look_s in self._looks_s.items() if look_s > since_s}
+            return frozenset(self._looks_s)
+
+    def is_looked_at(self, number: int) -> bool:
+        """True if a page looked at a map of late."""
+        with self._lock:
+            return time.monotonic() - self._looks_s.get(number, -LOOKED_AT_S) < LOOKED_AT_S
 
     def ready(self, name: str) -> bytes | None:
         """View of a name, if it is kept."""
@@ -155,6 +177,7 @@ class CellViews:
             DamagedCellError: kind `damaged_store`: it is damaged and cannot be rebuilt.
         """
         if depth is not None:
+            self.cache.note_look(row.number)
             try:
                 return self._answer(row, key, self._cells.unchecked(row, key), suffix, depth, known)
             except DamagedDataError:
@@ -172,6 +195,7 @@ class CellViews:
         Nothing is made for it: 15 us a cell. Views that are missing are asked for by cell.
         """
         depth = first_depth(row.geometry.depth)
+        self.cache.note_look(row.number)
         with self._store.snapshot(row) as snapshot:
             cells = [cell for cell in snapshot.cells(limit=BUNDLE_CELLS_MAX) if cell.voxels]
         found = bytearray()

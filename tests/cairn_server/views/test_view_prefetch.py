@@ -16,7 +16,7 @@ from cairn_map.evidence.grid import cell_of_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.live.fold_news import FoldNews
 from cairn_server.store.store_rows import MapRow
-from cairn_server.views import cell_views
+from cairn_server.views import cell_views, view_prefetch
 from cairn_server.views.cell_views import ViewCache, first_depth, view_name, view_of_stored
 from cairn_server.views.view_prefetch import ViewPrefetch
 
@@ -46,6 +46,29 @@ def test_what_a_page_asks_for_first_is_there_before_it_asks(live: Live) -> None:
                 assert answer.content in wanted.values()
                 assert decode_view(answer.content).view.depth == first_depth(3)
             assert views.made == made
+
+
+def test_a_map_that_pages_look_at_does_not_wait_for_the_views_of_others(
+    live: Live, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(view_prefetch, "AT_ONCE", 0)
+    monkeypatch.setattr(view_prefetch, "UNSEEN_PAUSE_SHARE", 1e9)
+    unseen, seen, views, news = live.new_map(), live.new_map(), live.service.views.cells.cache, FoldNews()
+    live.push(unseen, pushed(0, 0))
+    live.folded(unseen)
+    news.take()  # other tests' maps
+    news.note(unseen.number)
+    with closing(ViewPrefetch(live.service.store, views, news, look_every_s=SOON_S)):
+        until(
+            lambda: any(views.has(name) for name in coarse_views(live, unseen)),
+            "the first view is made, and others of its map wait",
+        )
+        live.http.get(f"/maps/{seen.name}/main/views")
+        live.push(seen, pushed(0, 1))
+        live.folded(seen)
+        news.note(seen.number)
+        until(lambda: all(views.has(name) for name in coarse_views(live, seen)), "views are made")
+        assert not all(views.has(name) for name in coarse_views(live, unseen))
 
 
 def test_a_map_in_which_nothing_happens_is_not_looked_at(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:

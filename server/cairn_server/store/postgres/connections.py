@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 import psycopg
 from psycopg import conninfo, errors
 from psycopg.pq import TransactionStatus
+from psycopg.types.array import ListBinaryDumper
 from psycopg.types.numeric import Int8BinaryDumper, Int8Dumper
 
 from cairn_map.errors import UnreachableError
@@ -85,6 +86,8 @@ def connect_to_any(url: str, settings: str = "", **options: str) -> Connection:
     # lists in it all would have the width that the first one needs.
     made.adapters.register_dumper(int, Int8Dumper)
     made.adapters.register_dumper(int, Int8BinaryDumper)
+    # As text, the bodies of a push are escaped in hexadecimal and searched for quotes: a seventh of a fold.
+    made.adapters.register_dumper(list, ListBinaryDumper)
     return made
 
 

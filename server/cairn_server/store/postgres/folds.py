@@ -2,8 +2,11 @@
 
 lock the head if it is the fold's base      another folder was faster, or was paused for an hour: nothing is written
 log, touched, commits, accounts             what is folded, and what is taken out
-cells, tiles, totals                        in batches: a fold may be larger than memory
-head, mark, NOTIFY                          one hint for those that wait for news; they ask the head in any case
+cells                                       in batches: a fold may be larger than memory
+tiles, head with its totals, NOTIFY, mark   one hint for those that wait for news; they ask the head in any case
+
+A fold of one commit is the most frequent one, and a statement costs much here and in the database whatever it does. So
+each line is one statement, but for what is rare.
 """
 
 from collections.abc import Iterator, Sequence
@@ -15,28 +18,60 @@ from cairn_server.store.objects.cold_bytes import NoObjects
 from cairn_server.store.postgres.connections import Connection, Connections, first, rows
 from cairn_server.store.postgres.shares import give_back_sums, lock_head
 from cairn_server.store.postgres.snapshot import PgSnapshot
-from cairn_server.store.postgres.tile_rows import PgTileWriter, recount_tile
+from cairn_server.store.postgres.tile_rows import (
+    COUNTED,
+    TOTALS,
+    Counted,
+    PgTileWriter,
+    recount_tile,
+    totals_from,
+    totals_values,
+)
 from cairn_server.store.store import LEASE_S
 from cairn_server.store.store_rows import CellRow, Fold, MapRow
-from cairn_server.store.tiles import tile_of
+from cairn_server.store.tiles import Corners, TileSums, tile_of
 
 CHANNEL = "cairn_fold"
 """Channel on which a fold notifies: number of the map, and its new seq."""
 BATCH_BYTES = 8 << 20
 """Bytes of cells that are written by one statement."""
-PUT_CELLS = """
+BASE = """
+    SELECT cells, cells_bytes, fingerprint, corners FROM head WHERE map = %s AND seq = %s AND chain = %s
+    FOR NO KEY UPDATE"""
+"""SQL that locks a map's head if it is a fold's base, and gives its totals."""
+LEAVE_OBJECTS = """
+    INSERT INTO dead_object (map, name, since_age_s)
+    SELECT map, object, %(age_s)s FROM cell
+    WHERE map = %(map)s AND layer = 0 AND cell = ANY(%(keys)s::bigint[]) AND object IS NOT NULL"""
+"""SQL that notes the objects of cells that are about to be written here, so that they are deleted in time."""
+PUT_CELLS = f"""
+WITH left_objects AS ({LEAVE_OBJECTS}
+), put AS (
     INSERT INTO cell (map, cell, lm, digest, fingerprint, voxels, size_bytes, hottest_k, body, stamps)
-    SELECT %s, u.* FROM unnest(
-        %s::bigint[], %s::bigint[], %s::bytea[], %s::bytea[], %s::bigint[], %s::bigint[], %s::float8[], %s::bytea[],
-        %s::bytea[]
+    SELECT %(map)s, u.* FROM unnest(
+        %(keys)s::bigint[], %(lms)s::bigint[], %(digests)s::bytea[], %(fingerprints)s::bytea[], %(voxels)s::bigint[],
+        %(sizes_bytes)s::bigint[], %(hottest_k)s::float8[], %(bodies)s::bytea[], %(stamps)s::bytea[]
     ) AS u
     ON CONFLICT (map, layer, cell) DO UPDATE SET lm = excluded.lm, digest = excluded.digest,
         fingerprint = excluded.fingerprint, voxels = excluded.voxels, size_bytes = excluded.size_bytes,
-        hottest_k = excluded.hottest_k, body = excluded.body, stamps = excluded.stamps, object = NULL"""
-LEAVE_OBJECTS = """
-    INSERT INTO dead_object (map, name, since_age_s)
-    SELECT map, object, %s FROM cell WHERE map = %s AND layer = 0 AND cell = ANY(%s) AND object IS NOT NULL"""
-"""SQL that notes the objects of cells that are about to be written here, so that they are deleted in time."""
+        hottest_k = excluded.hottest_k, body = excluded.body, stamps = excluded.stamps, object = NULL
+)
+{COUNTED}"""
+"""SQL that writes cells; its rows are the sums (`Counted`) that they and their tiles had until then."""
+ENTER = """
+WITH e AS (SELECT * FROM unnest(%(seqs)s::bigint[], %(kinds)s::bytea[], %(numbers)s::bigint[], %(chains)s::bytea[])
+        AS e (seq, kind, number, chain)
+), logged AS (
+    INSERT INTO log (map, seq, kind, commit_number, chain) SELECT %(map)s, seq, kind, number, chain FROM e
+), folded AS (
+    UPDATE commits SET folded_seq = e.seq, folded_age_s = %(age_s)s::float8
+    FROM e WHERE map = %(map)s AND commits.number = e.number AND e.kind = %(fold)s AND folded_seq IS NULL
+)
+INSERT INTO touched (map, layer, cell, seq, kind, robot, incarnation, n, size_bytes)
+SELECT d.map, d.layer, d.cell, e.seq, e.kind, c.robot, c.incarnation, c.n, coalesce(octet_length(d.body), d.size_bytes)
+FROM e JOIN commits AS c ON c.map = %(map)s AND c.number = e.number
+    JOIN diff AS d ON d.map = c.map AND d.commit_number = c.number"""
+"""SQL that writes a fold's log entries, what they touch, and which commits are folded by them."""
 
 CLAIM = """
 WITH wanted AS (SELECT * FROM unnest(%(maps)s::bigint[]) WITH ORDINALITY AS w (map, turn)),
@@ -58,8 +93,8 @@ RETURNING map
 
 def write_fold(connection: Connection, row: MapRow, fold: Fold, *, age_s: float) -> bool:
     """Cells, entries and head at an age of the store, if head and retracts are still where the fold begins."""
-    query = "SELECT 1 FROM head WHERE map = %s AND seq = %s AND chain = %s FOR NO KEY UPDATE"
-    if first(connection, query, (row.number, fold.base.seq, fold.base.chain)) is None:
+    base = first(connection, BASE, (row.number, fold.base.seq, fold.base.chain))
+    if base is None:
         return False
     # A part in which no commit was there to be taken out leaves the head where it is.
     query = "SELECT due_from FROM commits WHERE map = %s AND number = %s"
@@ -69,18 +104,14 @@ def write_fold(connection: Connection, row: MapRow, fold: Fold, *, age_s: float)
         return False
     _write_entries(connection, row, fold, age_s)
     _write_progress(connection, row, fold)
-    tiles = PgTileWriter(connection, row.number)
+    tiles = PgTileWriter(connection, row.number, totals_from(base))
     for batch in _batches(fold):
-        tiles.note(batch)
-        _put_cells(connection, row, batch, age_s=age_s)
-    tiles.write(folded=sum(entry.kind == ENTRY_FOLD for entry in fold.entries))
-    query = "UPDATE head SET seq = %s, chain = %s WHERE map = %s"
-    connection.execute(query, (fold.head.seq, fold.head.chain, row.number))
+        tiles.note(batch, _put_cells(connection, row, batch, age_s=age_s))
+    sums, corners = tiles.write()
+    _move_head(connection, row, fold, sums, corners)
     if crosses_mark(fold.base, fold.head):
         snapshot = PgSnapshot(connection, row.number, row.geometry.digest(), KnownVectors(), NoObjects())
         snapshot.keep_mark(fold.head.seq)
-    if fold.entries:
-        connection.execute("SELECT pg_notify(%s, %s)", (CHANNEL, f"{row.number} {fold.head.seq}"))
     return True
 
 
@@ -90,7 +121,7 @@ def heal_cell(connection: Connection, row: MapRow, cell: CellRow, *, age_s: floa
     is_same = "SELECT 1 FROM cell WHERE map = %s AND layer = 0 AND cell = %s AND lm = %s"
     if first(connection, is_same, (row.number, cell.key, cell.lm)) is None:
         return False
-    connection.execute(LEAVE_OBJECTS, (age_s, row.number, [int(cell.key)]))
+    connection.execute(LEAVE_OBJECTS, {"age_s": age_s, "map": row.number, "keys": [int(cell.key)]})
     # Stamps that are lost with an object count as if all of the cell had changed with its last entry.
     connection.execute(
         "UPDATE cell SET digest = %s, fingerprint = %s, voxels = %s, size_bytes = %s, body = %s, hottest_k = %s,"
@@ -157,31 +188,12 @@ def _write_entries(connection: Connection, row: MapRow, fold: Fold, age_s: float
         "chains": [entry.chain for _, entry in entries],
         "fold": ENTRY_FOLD,
     }
-    connection.execute(
-        "INSERT INTO log (map, seq, kind, commit_number, chain)"
-        " SELECT %(map)s, u.* FROM unnest(%(seqs)s::bigint[], %(kinds)s::bytea[], %(numbers)s::bigint[],"
-        " %(chains)s::bytea[]) AS u",
-        values,
-    )
-    of_entries = "unnest(%(seqs)s::bigint[], %(kinds)s::bytea[], %(numbers)s::bigint[]) AS e (seq, kind, number)"
-    connection.execute(
-        "INSERT INTO touched (map, layer, cell, seq, kind, robot, incarnation, n, size_bytes)"
-        " SELECT d.map, d.layer, d.cell, e.seq, e.kind, c.robot, c.incarnation, c.n,"
-        " coalesce(octet_length(d.body), d.size_bytes)"
-        f" FROM {of_entries} JOIN commits AS c ON c.map = %(map)s AND c.number = e.number"
-        " JOIN diff AS d ON d.map = c.map AND d.commit_number = c.number",
-        values,
-    )
-    connection.execute(
-        "UPDATE commits SET folded_seq = e.seq, folded_age_s = %(age_s)s"
-        f" FROM {of_entries} WHERE map = %(map)s AND commits.number = e.number AND e.kind = %(fold)s"
-        " AND folded_seq IS NULL",
-        values,
-    )
+    connection.execute(ENTER, values)
     out = [entry.commit for _, entry in entries if entry.kind != ENTRY_FOLD]
     if out:
         connection.execute(
-            f"UPDATE commits SET unfolded_seq = e.seq FROM {of_entries}"
+            "UPDATE commits SET unfolded_seq = e.seq"
+            " FROM unnest(%(seqs)s::bigint[], %(kinds)s::bytea[], %(numbers)s::bigint[]) AS e (seq, kind, number)"
             " WHERE map = %(map)s AND commits.number = e.number AND e.kind <> %(fold)s",
             values,
         )
@@ -217,10 +229,31 @@ def _batches(fold: Fold) -> Iterator[list[CellRow]]:
         yield batch
 
 
-def _put_cells(connection: Connection, row: MapRow, cells: list[CellRow], *, age_s: float) -> None:
-    connection.execute(LEAVE_OBJECTS, (age_s, row.number, [int(cell.key) for cell in cells]))
-    columns = (
-        (int(c.key), c.lm, c.digest, c.fingerprint.to_bytes(), c.voxels, c.size_bytes, c.hottest_k, c.body, c.stamps)
-        for c in cells
+def _put_cells(connection: Connection, row: MapRow, cells: list[CellRow], *, age_s: float) -> list[Counted]:
+    """Write cells; the sums that they and their tiles had until then."""
+    values = {
+        "map": row.number,
+        "age_s": age_s,
+        "keys": [int(cell.key) for cell in cells],
+        "tiles": list({tile_of(cell.key) for cell in cells}),
+        "lms": [cell.lm for cell in cells],
+        "digests": [cell.digest for cell in cells],
+        "fingerprints": [cell.fingerprint.to_bytes() for cell in cells],
+        "voxels": [cell.voxels for cell in cells],
+        "sizes_bytes": [cell.size_bytes for cell in cells],
+        "hottest_k": [cell.hottest_k for cell in cells],
+        "bodies": [cell.body for cell in cells],
+        "stamps": [cell.stamps for cell in cells],
+    }
+    return [Counted(*found) for found in rows(connection, PUT_CELLS, values)]
+
+
+def _move_head(connection: Connection, row: MapRow, fold: Fold, sums: TileSums, corners: Corners | None) -> None:
+    """Write the head with the map's totals, and tell those that wait for it if it moved."""
+    folded = sum(entry.kind == ENTRY_FOLD for entry in fold.entries)
+    notify = " RETURNING pg_notify(%s, %s)" if fold.entries else ""
+    hint = (CHANNEL, f"{row.number} {fold.head.seq}") if fold.entries else ()
+    connection.execute(
+        f"UPDATE head SET seq = %s, chain = %s, folded = folded + %s, {TOTALS} WHERE map = %s{notify}".encode(),
+        (fold.head.seq, fold.head.chain, folded, *totals_values(sums, corners), row.number, *hint),
     )
-    connection.execute(PUT_CELLS, (row.number, *(list(column) for column in zip(*columns, strict=True))))

@@ -3,10 +3,10 @@
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NamedTuple
 
 from cairn_map.commits.cursor import Cursor
-from cairn_map.commits.ids import Author, CommitId
+from cairn_map.commits.ids import Author, CommitId, Incarnation, RobotName
 from cairn_map.evidence.grid import CellKey, Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.store.history import KnownVectors
@@ -18,6 +18,59 @@ from cairn_server.store.postgres.schema import IS_WAITING
 from cairn_server.store.postgres.snapshot import OF_COMMIT, PgSnapshot
 from cairn_server.store.store_rows import MapRow, StoredCommit
 from cairn_server.store.stored_columns import ids_from_text
+
+STORED = """
+SELECT c.number, robot, incarnation, n, sha, meta, retracts, gone, c.due_from, signatures, d.*
+FROM {commits} AS c LEFT JOIN LATERAL (
+    SELECT array_agg(cell ORDER BY cell), array_agg(body ORDER BY cell), array_agg(segment ORDER BY cell),
+        array_agg(start_bytes ORDER BY cell), array_agg(size_bytes ORDER BY cell)
+    FROM diff WHERE map = %(map)s AND layer = 0 AND commit_number = c.number AND {reads}
+) AS d ON true"""
+"""SQL of commits with their diffs, one row each."""
+OF_ID = "map = %(map)s AND robot = %(robot)s AND incarnation = %(incarnation)s AND n = %(n)s"
+ONE = f"{STORED.format(commits='commits', reads='true')} WHERE {OF_ID}"
+PENDING = f"""
+WITH waiting AS (
+    SELECT number, due_from, size_bytes, row_number() OVER (PARTITION BY robot ORDER BY number) AS turn
+    FROM commits WHERE map = %(map)s AND {IS_WAITING} AND number <> ALL(%(skip)s::bigint[])
+), ordered AS (
+    SELECT number, row_number() OVER (ORDER BY turn, number) AS place,
+        sum(CASE WHEN due_from IS NULL THEN size_bytes ELSE 0 END) OVER (ORDER BY turn, number) AS total_bytes
+    FROM waiting
+), chosen AS (
+    SELECT * FROM ordered JOIN commits USING (number)
+    WHERE map = %(map)s AND (place = 1 OR (place <= %(limit)s AND total_bytes <= %(size_bytes_max)s))
+)
+{STORED.format(commits="chosen", reads="c.due_from IS NULL")} ORDER BY place"""
+"""SQL of the commits to be folded: one statement, since it is asked for a single commit most often. Of one that is
+folded, what its retract names is still to be done, and its own evidence, cold perhaps, is not needed."""
+
+
+class _StoredColumns(NamedTuple):
+    """Columns of `STORED`."""
+
+    number: int
+    robot: RobotName
+    incarnation: Incarnation
+    n: int
+    sha: bytes
+    text: bytes
+    retracts: str
+    gone: bool
+    due_from: int | None
+    signatures: str | None
+    cells: list[int] | None
+    """Cells of its diff, and below what is stored of each; None: no evidence is kept, or it is not needed."""
+    bodies: list[bytes] | None
+    segments: list[str | None] | None
+    starts: list[int] | None
+    sizes: list[int] | None
+
+    @property
+    def diff(self) -> list[tuple[int, bytes, str | None, int, int]]:
+        """Cells, each with its bytes, or the segment, start and size of those that are in the object store."""
+        columns = (self.cells or [], self.bodies or [], self.segments or [], self.starts or [], self.sizes or [])
+        return list(zip(*columns, strict=True))
 
 
 class PgReads:
@@ -74,27 +127,9 @@ class PgReads:
 
         First the oldest of each robot, then the second of each. Folded ones whose retract is under way are among them.
         """
-        turn = "row_number() OVER (PARTITION BY robot ORDER BY number)"
-        clause = (
-            f"map = %(map)s AND {IS_WAITING} AND number <> ALL(%(skip)s::bigint[])"
-            f" ORDER BY {turn}, number LIMIT %(limit)s"
-        )
-        values = {"map": row.number, "skip": sorted(skip), "limit": limit}
-        with self._connections.snapshot() as connection:
-            found = rows(connection, f"SELECT number, size_bytes, due_from FROM commits WHERE {clause}", values)
-            numbers: list[int] = []
-            unread: set[int] = set()
-            total_bytes = 0
-            for number, size_bytes, due_from in found:
-                # Folded: what its retract names is still to be done, and its own evidence, cold perhaps, is not needed.
-                if due_from is not None:
-                    unread.add(number)
-                else:
-                    total_bytes += size_bytes
-                if numbers and total_bytes > size_bytes_max:
-                    break
-                numbers.append(number)
-            commits = _commits(connection, row, numbers, self._objects, unread=unread)
+        values = {"map": row.number, "skip": sorted(skip), "limit": limit, "size_bytes_max": size_bytes_max}
+        with self._connections.lent() as connection:
+            commits = _commits(connection, PENDING, values, self._objects)
             cold = _cold_cells(connection, row, commits) if self._ahead is not None else []
         # No transaction waits for it.
         if self._ahead is not None:
@@ -103,7 +138,7 @@ class PgReads:
 
     def commit(self, row: MapRow, commit: CommitId) -> StoredCommit | None:
         """A commit with its diff, folded or not; None if there is none."""
-        return self._commit(row, commit, OF_COMMIT)
+        return self._commit(row, commit, ONE)
 
     def kept_sha(self, row: MapRow, commit: CommitId) -> bytes | None:
         """SHA-256 of a commit whose evidence is kept, folded or not; None if there is none. No evidence is read."""
@@ -114,7 +149,7 @@ class PgReads:
 
     def folded(self, row: MapRow, commit: CommitId) -> StoredCommit | None:
         """A folded commit with its diff, or None."""
-        return self._commit(row, commit, f"{OF_COMMIT} AND folded_seq IS NOT NULL")
+        return self._commit(row, commit, f"{ONE} AND folded_seq IS NOT NULL")
 
     def is_retracted(self, row: MapRow, commit: CommitId) -> bool:
         """True if a retract of this id has taken effect, or waits for the commit to come."""
@@ -149,51 +184,37 @@ class PgReads:
                 )
         return [self._maps[number] for number, _ in found]
 
-    def _commit(self, row: MapRow, commit: CommitId, clause: str) -> StoredCommit | None:
-        with self._connections.snapshot() as connection:
-            query = f"SELECT number FROM commits WHERE {clause}"
-            number = first(connection, query, (row.number, *commit.author, commit.n))
-            return None if number is None else _commits(connection, row, [number], self._objects)[0]
+    def _commit(self, row: MapRow, commit: CommitId, query: str) -> StoredCommit | None:
+        robot, incarnation = commit.author
+        values = {"map": row.number, "robot": robot, "incarnation": incarnation, "n": commit.n}
+        with self._connections.lent() as connection:
+            found = _commits(connection, query, values, self._objects)
+        return found[0] if found else None
 
 
-def _commits(
-    connection: Connection, row: MapRow, numbers: list[int], objects: ColdReads, *, unread: Collection[int] = ()
-) -> list[StoredCommit]:
-    """Commits of these numbers, in this order, with their diffs, but for the `unread` ones.
+def _commits(connection: Connection, query: str, values: dict[str, Any], objects: ColdReads) -> list[StoredCommit]:
+    """Commits that a query of `COMMIT_COLUMNS` gives, with their diffs.
 
     Raises:
         AwayError: a diff is in the object store, which does not answer.
     """
-    if not numbers:
-        return []
-    bodies: defaultdict[int, dict[CellKey, bytes]] = defaultdict(dict)
-    query = (
-        "SELECT commit_number, cell, body, segment, start_bytes, size_bytes FROM diff"
-        " WHERE map = %s AND layer = 0 AND commit_number = ANY(%s) ORDER BY cell"
-    )
-    found = rows(connection, query, (row.number, [number for number in numbers if number not in unread]))
-    cold = _cold_bodies([each[3:] for each in found if each[3] is not None], objects)
-    for number, cell, body, name, start, _ in found:
-        bodies[number][CellKey(cell)] = body if name is None else cold[name, start]
-    columns = "number, robot, incarnation, n, sha, meta, retracts, gone, due_from, signatures"
-    query = f"SELECT {columns} FROM commits WHERE map = %s AND number = ANY(%s)"
-    known = {
-        number: StoredCommit(
-            number=number,
-            id=CommitId(Author(*author), n),
-            sha=sha,
-            text=text,
-            retracts=ids_from_text(retracts),
-            diff=bodies[number],
-            gone=gone,
-            signatures=signed,
-            due_from=due_from,
+    found = [_StoredColumns(*columns) for columns in rows(connection, query, values)]
+    diffs = [each.diff for each in found]
+    cold = _cold_bodies([(name, start, size) for diff in diffs for _, _, name, start, size in diff if name], objects)
+    return [
+        StoredCommit(
+            number=each.number,
+            id=CommitId(Author(each.robot, each.incarnation), each.n),
+            sha=each.sha,
+            text=each.text,
+            retracts=ids_from_text(each.retracts),
+            diff={CellKey(cell): cold[name, start] if name else body for cell, body, name, start, _ in diff},
+            gone=each.gone,
+            signatures=each.signatures,
+            due_from=each.due_from,
         )
-        for number, *author, n, sha, text, retracts, gone, due_from, signed in rows(
-            connection, query, (row.number, numbers)
-        )
-    }
-    return [known[number] for number in numbers]
+        for each, diff in zip(found, diffs, strict=True)
+    ]
 
 
 def _cold_cells(connection: Connection, row: MapRow, commits: Iterable[StoredCommit]) -> list[NamedSize]:

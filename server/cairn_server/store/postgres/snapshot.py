@@ -41,6 +41,8 @@ OF_COMMIT = "map = %s AND robot = %s AND incarnation = %s AND n = %s"
 LOG_COLUMNS = (
     "seq, kind, robot, incarnation, n, sha, size_bytes, cells, captured_first_s, captured_last_s, retracts, meta, via"
 )
+HELD_CELLS, HELD_BYTES_MAX = 16, 1 << 20
+"""Most cells that are read at once, and the size from which on a cell is not among them."""
 LOG_PAGE = 64
 """Log entries that are read at once, as each comes with its commit's meta."""
 
@@ -65,6 +67,7 @@ class PgSnapshot:
         if head is None:
             raise lost_map(map_number)
         self._head = Cursor(*head)
+        self._held: dict[CellKey, CellRow | None] = {}
 
     @property
     def head(self) -> Cursor:
@@ -87,6 +90,8 @@ class PgSnapshot:
         Raises:
             AwayError: it is in the object store, which does not answer.
         """
+        if key in self._held:
+            return self._held[key]
         query = f"SELECT {CELL_COLUMNS}, body, stamps, object FROM cell WHERE {OF_MAP} AND cell = %(key)s"
         row = first(self._connection, query, {"map": self._map, "key": key})
         if row is None:
@@ -96,6 +101,19 @@ class PgSnapshot:
         if body is None:
             body, stamps = split_cell_object(self._objects.get(name))
         return cell_row((*columns, body, stamps))
+
+    def hold_cells(self, keys: Collection[CellKey]) -> None:
+        """Read up to `HELD_CELLS` of these cells at once, none of them large or cold, for `cell`."""
+        some = list(islice(keys, HELD_CELLS))
+        if not some:
+            return
+        query = (
+            f"SELECT key, {CELL_COLUMNS}, body, stamps FROM unnest(%(keys)s::bigint[]) AS u (key)"
+            f" LEFT JOIN cell ON {OF_MAP} AND cell = key"
+            f" WHERE cell IS NULL OR (body IS NOT NULL AND size_bytes < {HELD_BYTES_MAX})"
+        )
+        for key, *columns in rows(self._connection, query, {"map": self._map, "keys": some}):
+            self._held[CellKey(key)] = cell_row(tuple(columns)) if columns[0] is not None else None
 
     def cells(
         self, *, after_seq: int = -1, after_key: int = -1, limit: int | None = None, box: Box | None = None

@@ -1,7 +1,7 @@
 """Tiles and totals of maps in PostgreSQL: read for requests, written by folds and heals under the head's lock."""
 
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -34,14 +34,49 @@ IN_TILES = (
 """SQL of the cells of tiles: a range of the primary key for each. Without the limit, which is never reached, a range is
 taken for a ninth of the table, and the whole map is read."""
 OF_MAP = "map = %(map)s AND layer = 0"
+COUNTED = f"""
+SELECT false, cell, 0::bigint, fingerprint, voxels, size_bytes FROM cell
+WHERE {OF_MAP} AND cell = ANY(%(keys)s::bigint[])
+UNION ALL
+SELECT true, tile, lm, fingerprint, cells, size_bytes FROM tile WHERE {OF_MAP} AND tile = ANY(%(tiles)s::bigint[])"""
+"""SQL of what cells and tiles are counted as (`Counted`), before the statement that it is a part of."""
+TOTALS = "cells = %s, cells_bytes = %s, fingerprint = %s, corners = %s::bigint[]"
+"""SQL that sets a head's totals to `totals_values`."""
 
 
-def totals_of(connection: Connection, map_number: int) -> tuple[TileSums, Corners | None]:
+Totals = tuple[TileSums, Corners | None]
+"""Sums over all cells of a map, and the corners of those with a voxel."""
+
+
+class Counted(NamedTuple):
+    """Sums of a cell or a tile as they are stored."""
+
+    is_tile: bool
+    number: int
+    lm: int
+    fingerprint: bytes
+    content: int
+    """Voxels of a cell, cells of a tile."""
+    size_bytes: int
+
+
+def totals_of(connection: Connection, map_number: int) -> Totals:
     """Sums over all cells of a map, and the corners of those with a voxel."""
     query = "SELECT cells, cells_bytes, fingerprint, corners FROM head WHERE map = %s"
-    cells, size_bytes, fingerprint, corners = first(connection, query, (map_number,))
+    return totals_from(first(connection, query, (map_number,)))
+
+
+def totals_from(columns: tuple[Any, ...]) -> Totals:
+    """Totals in these columns of a head: cells, cells_bytes, fingerprint, corners."""
+    cells, size_bytes, fingerprint, corners = columns
     found = (tuple(corners[:3]), tuple(corners[3:])) if corners else None
     return TileSums(0, cells, size_bytes, fingerprint_from_bytes(fingerprint)), found
+
+
+def totals_values(sums: TileSums, corners: Corners | None) -> tuple[Any, ...]:
+    """Values of `TOTALS`."""
+    ends = [*corners[0], *corners[1]] if corners else None
+    return sums.cells, sums.size_bytes, sums.fingerprint.to_bytes(), ends
 
 
 def tiles_changed(connection: Connection, map_number: int, *, after_seq: int, box: Box | None) -> list[int]:
@@ -72,40 +107,38 @@ def fingerprint_in_box(connection: Connection, map_number: int, box: Box) -> Fin
 class PgTileWriter:
     """Tiles and totals of one map, changed along with its cells, in one transaction that has locked its head."""
 
-    def __init__(self, connection: Connection, map_number: int) -> None:
+    def __init__(self, connection: Connection, map_number: int, totals: Totals) -> None:
+        """Change them from these totals on."""
         self._connection = connection
         self._map = map_number
-        self._sums, corners = totals_of(connection, map_number)
+        self._sums, corners = totals
         self._changes = TileChanges(corners)
+        self._known: dict[int, TileSums] = {}
 
-    def note(self, cells: Sequence[CellRow]) -> None:
-        """Count cells that are about to be written, each of them once."""
-        query = f"SELECT cell, fingerprint, voxels, size_bytes FROM cell WHERE {OF_MAP} AND cell = ANY(%(keys)s)"
-        found = rows(self._connection, query, {"map": self._map, "keys": [int(cell.key) for cell in cells]})
-        before = {key: _counted(key, *sums) for key, *sums in found}
+    def note(self, cells: Sequence[CellRow], before: Sequence[Counted]) -> None:
+        """Count cells, each of them once, which with their tiles were counted as this before they were written."""
+        self._known |= {known.number: _tile_sums(*known[1:]) for known in before if known.is_tile}
+        had = {known.number: _counted(known) for known in before if not known.is_tile}
         for cell in cells:
-            self._changes.add(before.get(cell.key), cell)
+            self._changes.add(had.get(cell.key), cell)
 
-    def write(self, *, folded: int) -> None:
-        """Write what changed, after the cells; so many commits are folded with it."""
+    def write(self) -> Totals:
+        """Write the tiles, after the cells; the totals of the map, which are written with its head."""
         changes = self._changes
-        known = _tiles(self._connection, self._map, changes.tiles)
-        _put_tiles(
-            self._connection,
-            self._map,
-            {tile: known.get(tile, TileSums()) + change for tile, change in changes.tiles.items()},
-        )
+        tiles = {tile: self._known.get(tile, TileSums()) + change for tile, change in changes.tiles.items()}
+        if tiles:
+            _put_tiles(self._connection, self._map, tiles)
         corners = changes.corners
         if changes.has_emptied_border:
             corners = _measured_corners(self._connection, self._map)
-        _put_totals(self._connection, self._map, self._sums + changes.total, corners)
-        query = "UPDATE head SET folded = folded + %s WHERE map = %s"
-        self._connection.execute(query, (folded, self._map))
+        return self._sums + changes.total, corners
 
 
 def recount_tile(connection: Connection, map_number: int, tile: int) -> None:
     """Compute a tile's sums again from its cells: the row of a damaged cell does not say what it was counted as."""
-    before = _tiles(connection, map_number, [tile]).get(tile, TileSums())
+    query = f"SELECT tile, lm, fingerprint, cells, size_bytes FROM tile WHERE {OF_MAP} AND tile = %(tile)s"
+    known = first(connection, query, {"map": map_number, "tile": tile})
+    before = _tile_sums(*known) if known is not None else TileSums()
     query = f"SELECT lm, voxels > 0, size_bytes, fingerprint FROM {IN_TILES}"
     found = rows(connection, query, {"map": map_number, "tiles": [tile]})
     after = sum(
@@ -120,19 +153,21 @@ def recount_tile(connection: Connection, map_number: int, tile: int) -> None:
     _put_totals(connection, map_number, sums + after - before, _measured_corners(connection, map_number))
 
 
-def _counted(key: int, fingerprint: bytes, voxels: int, size_bytes: int) -> CellRow:
+def _counted(known: Counted) -> CellRow:
     """A cell with what is counted of it."""
-    sums = fingerprint_from_bytes(fingerprint)
-    return CellRow(key=CellKey(key), lm=0, digest=b"", fingerprint=sums, voxels=voxels, body=b"", size_bytes=size_bytes)
+    return CellRow(
+        key=CellKey(known.number),
+        lm=0,
+        digest=b"",
+        fingerprint=fingerprint_from_bytes(known.fingerprint),
+        voxels=known.content,
+        body=b"",
+        size_bytes=known.size_bytes,
+    )
 
 
-def _tiles(connection: Connection, map_number: int, tiles: Iterable[int]) -> dict[int, TileSums]:
-    query = f"SELECT tile, lm, cells, size_bytes, fingerprint FROM tile WHERE {OF_MAP} AND tile = ANY(%(tiles)s)"
-    found = rows(connection, query, {"map": map_number, "tiles": list(tiles)})
-    return {
-        tile: TileSums(lm, cells, size_bytes, fingerprint_from_bytes(fingerprint))
-        for tile, lm, cells, size_bytes, fingerprint in found
-    }
+def _tile_sums(_: int, lm: int, fingerprint: bytes, cells: int, size_bytes: int) -> TileSums:
+    return TileSums(lm, cells, size_bytes, fingerprint_from_bytes(fingerprint))
 
 
 def _put_tiles(connection: Connection, map_number: int, tiles: dict[int, TileSums]) -> None:
@@ -154,16 +189,8 @@ def _put_tiles(connection: Connection, map_number: int, tiles: dict[int, TileSum
 
 
 def _put_totals(connection: Connection, map_number: int, sums: TileSums, corners: Corners | None) -> None:
-    connection.execute(
-        "UPDATE head SET cells = %s, cells_bytes = %s, fingerprint = %s, corners = %s::bigint[] WHERE map = %s",
-        (
-            sums.cells,
-            sums.size_bytes,
-            sums.fingerprint.to_bytes(),
-            [*corners[0], *corners[1]] if corners else None,
-            map_number,
-        ),
-    )
+    query = f"UPDATE head SET {TOTALS} WHERE map = %s".encode()
+    connection.execute(query, (*totals_values(sums, corners), map_number))
 
 
 def _measured_corners(connection: Connection, map_number: int) -> Corners | None:

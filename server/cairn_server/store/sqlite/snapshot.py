@@ -77,6 +77,9 @@ class SqliteSnapshot:
             )
         return cell_row(row) if row else None
 
+    def hold_cells(self, keys: Collection[CellKey]) -> None:
+        """Nothing: a cell is read in 30 us, one by one as well."""
+
     def cells(
         self, *, after_seq: int = -1, after_key: int = -1, limit: int | None = None, box: Box | None = None
     ) -> Iterator[CellRow]:
