@@ -1,4 +1,5 @@
 """Evidence by epoch of capture, and its reading: now, at a time, and what changed between two times.
 
-A cell's sums, without time, are `evidence`; the bytes are `codec`. Start with `cell_history.py`, then `present.py`.
+A cell's sums, without time, are `evidence`; the bytes are `codec`. Start with `cell_history.py`, the value; then
+`history_cell.py` and `history_map.py`, to which commits are added, and `present.py`, the reading.
 """

@@ -112,8 +112,12 @@ def history_fingerprint(history: CellHistory, key: CellKey, *, layer_word: int) 
         key: the cell's number.
         layer_word: `MapLayer.word`; with 0, the fingerprint of a cell that has a base alone is that of its evidence.
     """
-    cell, found = np.uint64((key + layer_word) & MASK), ZERO
-    for epoch, row in history.rows.items():
-        seeds = cell_seeds(cell) if epoch == BASE else epoch_seeds(cell, np.int64(epoch))
-        found += fingerprint_of_seeds(row, seeds)
-    return found
+    rows = history.rows.items()
+    return sum((row_fingerprint(row, epoch, key, layer_word=layer_word) for epoch, row in rows), ZERO)
+
+
+def row_fingerprint(row: Evidence, epoch: Epoch, key: CellKey, *, layer_word: int) -> Fingerprint:
+    """Part of a cell's fingerprint that one row makes; arguments as for `history_fingerprint`."""
+    cell = np.uint64((key + layer_word) & MASK)
+    seeds = cell_seeds(cell) if epoch == BASE else epoch_seeds(cell, np.int64(epoch))
+    return fingerprint_of_seeds(row, seeds)

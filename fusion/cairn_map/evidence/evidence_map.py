@@ -44,6 +44,8 @@ class EvidenceMap:
         self._coding = coding
         self._cells: dict[CellKey, _Entry] = {}
         self._size_bytes = 0
+        self._rests = False
+        """True if every cell is held as its bytes."""
 
     def __iter__(self) -> Iterator[CellKey]:
         return iter(sorted(self._cells))
@@ -115,13 +117,27 @@ class EvidenceMap:
             cell.merge(evidence)
             self._hold(key, cell, body=body, came_bytes=came_bytes)
 
+    def drop(self, key: CellKey) -> None:
+        """Hold nothing of a cell."""
+        self._forget(key)
+
+    def rest(self) -> None:
+        """Hold every cell as its bytes from here on: little memory, and each change decodes and encodes one.
+
+        Without a coding the map stays as it is.
+        """
+        self._rests = self._coding is not None
+        for key, entry in list(self._cells.items()):
+            if isinstance(entry.cell, BrickCell):
+                self._hold(key, entry.cell, body=None, came_bytes=entry.came_bytes)
+
     def copy(self) -> "EvidenceMap":
         """The same sums, unaffected by later merges; cells share their arrays until one of the two is changed."""
         copied = EvidenceMap(self.geometry, coding=self._coding)
         for key, entry in self._cells.items():
             cell = entry.cell.copy() if isinstance(entry.cell, BrickCell) else entry.cell
             copied._cells[key] = entry._replace(cell=cell)
-        copied._size_bytes = self._size_bytes
+        copied._size_bytes, copied._rests = self._size_bytes, self._rests
         return copied
 
     def held(self, key: CellKey) -> HeldCell | None:
@@ -189,10 +205,10 @@ class EvidenceMap:
         """Hold a cell's sums, or its bytes if too few came for them; `body` are those of just these sums."""
         came_bytes = max(came_bytes, len(body or b""))
         cell: HeldCell = sums
-        if self._coding is not None and sums.size_bytes > HELD_PER_BYTE * came_bytes:
+        if self._coding is not None and (self._rests or sums.size_bytes > HELD_PER_BYTE * came_bytes):
             body = self._coding.encode(key, sums.packed()) if body is None else body
             came_bytes = max(came_bytes, len(body))
-            if sums.size_bytes > HELD_PER_BYTE * came_bytes:
+            if self._rests or sums.size_bytes > HELD_PER_BYTE * came_bytes:
                 cell = CompactCell(body, self.geometry, self._coding)
         self._put(key, cell, came_bytes)
 

@@ -1,0 +1,174 @@
+"""A map with epochs in memory: a map of sums for each epoch, of which the newest is open and the others rest as bytes.
+
+    map.merge(diff, epoch=e)     add a measurement      map.unmerge(diff, epoch=e)     take it out again, exactly
+    map.history(key)             rows of a cell         map.evidence(key)              their sum
+
+A map without epochs has the base alone, and is held as an `EvidenceMap` is.
+"""
+
+import hashlib
+from collections.abc import Iterable, Iterator, Mapping
+
+from cairn_map.epochs.cell_history import CellHistory, cell_history
+from cairn_map.epochs.epoch import BASE, Epoch
+from cairn_map.epochs.layer import MapLayer
+from cairn_map.evidence.compact_cell import CellCoding
+from cairn_map.evidence.evidence import Evidence
+from cairn_map.evidence.evidence_map import NO_BODIES, Bodies, Diff, EvidenceMap
+from cairn_map.evidence.grid import CellKey, Geometry
+
+NO_ROWS: Mapping[Epoch, bytes] = {}
+
+
+class HistoryMap:
+    """Sums of evidence over any number of cells, by epoch; not thread-safe."""
+
+    def __init__(self, layer: MapLayer, *, coding: CellCoding | None = None) -> None:
+        """Make an empty map; without a `coding` every row is held as sums."""
+        self.layer = layer
+        self._coding = coding
+        self._rows: dict[Epoch, EvidenceMap] = {BASE: EvidenceMap(layer.geometry, coding=coding)}
+        self._versions: dict[CellKey, int] = {}
+        self._version = 0
+
+    def __iter__(self) -> Iterator[CellKey]:
+        return iter(sorted(set().union(*self._rows.values())))
+
+    def __len__(self) -> int:
+        return len(set().union(*self._rows.values()))
+
+    def __repr__(self) -> str:
+        return f"HistoryMap({len(self)} cells, {len(self.epochs)} epochs, {self.size_bytes} bytes, {self.geometry})"
+
+    def __contains__(self, key: CellKey) -> bool:
+        return any(key in row for row in self._rows.values())
+
+    def __eq__(self, other: object) -> bool:
+        """True for the same evidence in the same rows of the same layer, however it came together."""
+        if not isinstance(other, HistoryMap | EvidenceMap):
+            return NotImplemented
+        return self.geometry == other.geometry and self.digest() == other.digest()
+
+    __hash__ = None  # type: ignore[assignment]  # it changes
+
+    @property
+    def geometry(self) -> Geometry:
+        """Voxel edge, cells and channels."""
+        return self.layer.geometry
+
+    @property
+    def epochs(self) -> tuple[Epoch, ...]:
+        """Epochs of which some cell has a row, rising."""
+        return tuple(epoch for epoch in sorted(self._rows) if len(self._rows[epoch]))
+
+    @property
+    def size_bytes(self) -> int:
+        """Memory held by the rows' arrays and bytes."""
+        return sum(row.size_bytes for row in self._rows.values())
+
+    @property
+    def base(self) -> EvidenceMap:
+        """Evidence without a time; of a map without epochs, all of it."""
+        return self._rows[BASE]
+
+    def digest(self) -> str:
+        """SHA-256, in hex, of all evidence: equal maps have equal digests, on any machine.
+
+        Of a map without epochs it is `EvidenceMap.digest`. Else it is over the layer's digest, and for each epoch that
+        has a row, rising, over its number as an int64, little-endian, and the `EvidenceMap.digest` of its rows.
+        """
+        if not self.layer.has_epochs:
+            return self.base.digest()
+        found = hashlib.sha256(self.layer.digest())
+        for epoch in self.epochs:
+            if (row := self._rows[epoch]).packed():
+                found.update(epoch.to_bytes(8, "little", signed=True) + bytes.fromhex(row.digest()))
+        return found.hexdigest()
+
+    def merge(self, diff: Diff, *, epoch: Epoch = BASE, bodies: Bodies = NO_BODIES) -> None:
+        """Add a diff to the rows of an epoch.
+
+        Args:
+            diff: packed evidence by cell.
+            epoch: that of the evidence.
+            bodies: bytes of the diff's cells, as far as the caller has them: they need not be encoded again.
+
+        Raises:
+            BadInputError: kind `evidence_overflow`; nothing was changed.
+        """
+        self._of(epoch).merge(diff, bodies=bodies)
+        self._note(diff)
+
+    def unmerge(self, diff: Diff, *, epoch: Epoch = BASE) -> None:
+        """Take a diff out again; it must have been merged before, else sums become negative.
+
+        Raises:
+            BadInputError: kind `evidence_overflow`; nothing was changed.
+        """
+        self._of(epoch).unmerge(diff)
+        self._note(diff)
+
+    def replace(
+        self, key: CellKey, history: CellHistory, *, bodies: Mapping[Epoch, bytes] = NO_ROWS, came_bytes: int = 0
+    ) -> None:
+        """Make one cell hold exactly these rows; one that holds none takes no memory.
+
+        Args:
+            key: the cell's number.
+            history: its rows from here on.
+            bodies: bytes of these very rows, each as a cell file of version 1, as far as the caller has them.
+            came_bytes: bytes that came for the cell.
+        """
+        for epoch in self._rows.keys() - history.rows.keys():
+            self._rows[epoch].drop(key)
+        for epoch, row in history.rows.items():
+            self._of(epoch).replace(key, row, body=bodies.get(epoch), came_bytes=came_bytes)
+        self._note((key,))
+
+    def copy(self) -> "HistoryMap":
+        """The same rows, unaffected by later merges; cells share their arrays until one of the two is changed."""
+        copied = HistoryMap(self.layer, coding=self._coding)
+        copied._rows = {epoch: row.copy() for epoch, row in self._rows.items()}
+        copied._versions, copied._version = dict(self._versions), self._version
+        return copied
+
+    def version(self, key: CellKey) -> int:
+        """Number that is another one after each change of a cell."""
+        return self._versions.get(key, 0)
+
+    def history(self, key: CellKey) -> CellHistory:
+        """Rows of one cell."""
+        return cell_history({epoch: row.evidence(key) for epoch, row in self._rows.items() if key in row})
+
+    def evidence(self, key: CellKey) -> Evidence:
+        """Packed sum of all rows of one cell: what a map without epochs would hold (rule T5)."""
+        if not self.layer.has_epochs:
+            return self.base.evidence(key)
+        return self.history(key).total(self.geometry)
+
+    def packed(self) -> dict[CellKey, Evidence]:
+        """`evidence` of all cells that hold any, rising in number."""
+        everything = ((key, self.evidence(key)) for key in self)
+        return {key: evidence for key, evidence in everything if len(evidence)}
+
+    def cell_bytes(self, key: CellKey) -> int:
+        """Memory held by one cell; 0 if there is none."""
+        return sum(row.cell_bytes(key) for row in self._rows.values())
+
+    def clear(self) -> None:
+        """Drop all cells."""
+        keys = list(self)
+        self._rows = {BASE: EvidenceMap(self.geometry, coding=self._coding)}
+        self._note(keys)
+
+    def _of(self, epoch: Epoch) -> EvidenceMap:
+        """Map of an epoch's rows; once a newer one begins, the others are held as bytes (rule R5)."""
+        if epoch not in self._rows:
+            newest = max(self._rows)
+            self._rows[epoch] = EvidenceMap(self.geometry, coding=self._coding)
+            self._rows[min(newest, epoch)].rest()
+        return self._rows[epoch]
+
+    def _note(self, keys: Iterable[CellKey]) -> None:
+        self._version += 1
+        self._versions.update(dict.fromkeys(keys, self._version))
