@@ -52,8 +52,8 @@ def digests(map_url: str, folder: Path, name: str) -> dict[str, bytes]:
     """The folded cells as `export --cells` writes them, without what the server's compressor may choose."""
     wait_for_fold(map_url)
     cairn("map", "export", map_url, "--cells", name, folder=folder)
-    geometry = read_head(folder / name).geometry
-    return {str(cell.key): cell.digest for cell in read_cells(folder / name, geometry)}
+    layer = read_head(folder / name).layer
+    return {str(cell.key): cell.digest for cell in read_cells(folder / name, layer)}
 
 
 def test_two_robots_that_share_a_recording_make_the_map_of_one(

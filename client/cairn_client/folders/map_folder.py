@@ -15,8 +15,9 @@ from cairn_client.replica.replica import Replica
 from cairn_client.replica.replica_store import FILE_NAME
 from cairn_map.codec.cell_code import coding_of, decode_cell
 from cairn_map.codec.cell_reading import EVIDENCE_BYTES_MAX
+from cairn_map.codec.layer_code import row_bodies
+from cairn_map.epochs.history_map import HistoryMap
 from cairn_map.errors import BadInputError
-from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.grid import CellKey, cell_of_key
 from cairn_map.files.cell_folder import MAP_FILE, cell_path, read_cells, read_head
 from cairn_map.machine_memory import standard_limit_bytes
@@ -73,11 +74,11 @@ def map_of_folder(folder: Path) -> FolderMap:
             return FolderMap(replica.snapshot(), ages_of(replica))
     if (folder / MAP_FILE).is_file():
         head = read_head(folder)
-        whole = EvidenceMap(head.geometry, coding=coding_of(head.geometry))
-        for cell in read_cells(folder, head.geometry):
+        whole = HistoryMap(head.layer, coding=coding_of(head.geometry))
+        for cell in read_cells(folder, head.layer):
             size_bytes = cell_path(folder, cell_of_key(cell.key)).stat().st_size
-            whole.replace(cell.key, cell.evidence, came_bytes=size_bytes)
-        return FolderMap(snapshot_of(whole, head.sensor_model), None)
+            whole.replace(cell.key, cell.history, came_bytes=size_bytes)
+        return FolderMap(snapshot_of(whole.base, head.sensor_model), None)
     raise BadInputError(
         "no_map_folder",
         f"{folder} holds no map: neither {MAP_FILE} and cells (`cairn map export URL --cells DIR`) nor a robot's "
@@ -89,20 +90,21 @@ def _downloaded_map(map_url: str, token: str | None, memory_bytes_max: int) -> M
     server_url, name = split_map_url(map_url)
     with MapApi(server_url, token=token) as api:
         info = api.map_info(name)
-        whole = EvidenceMap(info.geometry, coding=coding_of(info.geometry))
+        whole = HistoryMap(info.layer, coding=coding_of(info.geometry))
         for key in cells_with_evidence(api, name):
             # What is left bounds the cell before it is decoded: few bytes may stand for much evidence.
             left_bytes = memory_bytes_max - whole.size_bytes
             try:
-                body, decoded = download_cell(api, name, key, evidence_bytes_max=min(left_bytes, EVIDENCE_BYTES_MAX))
+                bytes_max = min(left_bytes, EVIDENCE_BYTES_MAX)
+                body, decoded = download_cell(api, name, key, info.layer, evidence_bytes_max=bytes_max)
             except BadInputError as exc:
                 if exc.kind == "too_large" and left_bytes < EVIDENCE_BYTES_MAX:
                     raise _too_large(map_url, memory_bytes_max) from exc
                 raise
-            whole.replace(decoded.key, decoded.evidence, body=body)
+            whole.replace(key, decoded.history, bodies=row_bodies(body, key, info.layer), came_bytes=len(body))
             if whole.size_bytes > memory_bytes_max:
                 raise _too_large(map_url, memory_bytes_max)
-    return snapshot_of(whole, info.sensor_model)
+    return snapshot_of(whole.base, info.sensor_model)
 
 
 def _too_large(map_url: str, memory_bytes_max: int) -> BadInputError:

@@ -39,9 +39,10 @@ from cairn_fusion.recording.scan_bytes import move_scan, place_scan
 from cairn_map.codec.cell_code import Profile
 from cairn_map.commits.commit import Commit, CommitMeta, split_commit
 from cairn_map.commits.ids import CommitId, RobotName, commit_id_from_text, robot_name
+from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import BadInputError, CairnError, ConflictError, DamagedDataError, UnreachableError
 from cairn_map.evidence.evidence import Evidence
-from cairn_map.evidence.grid import CellKey, Geometry
+from cairn_map.evidence.grid import CellKey
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -147,7 +148,7 @@ class _Opened:
     state: ReplicaState
     outbox: Outbox
     kept: KeptScans
-    geometry: Geometry
+    layer: MapLayer
     robot: RobotName
     write: AmendWriter
 
@@ -195,25 +196,23 @@ def _opened(folder: Path) -> Iterator[_Opened]:
     check_state_folder(folder)
     with closing(ReplicaStore(folder)) as store:
         state = ReplicaState(store)
-        known, map_name, geometry = state.robot, state.map_name, state.geometry
-        if known is None or map_name is None or geometry is None:
+        known, map_name, layer = state.robot, state.map_name, state.layer
+        if known is None or map_name is None or layer is None:
             raise BadInputError("no_state_folder", f"{folder} was never used by a robot, so no scans are kept there")
         if state.mode == "viewer":
             raise BadInputError("viewer", f"{folder} is a copy of a map, which makes no commits; name robots' folders")
         robot, limits = robot_name(known), state.limits or STANDARD_LIMITS
         kept = KeptScans(folder / "scans", bytes_max=0)
         if limits.keeps_commits:
-            outbox, write = _unbounded(state, robot, geometry, kept)
+            outbox, write = _unbounded(state, robot, layer, kept)
         else:
-            outbox, write = _bounded(state, robot, map_name, geometry, limits)
-        yield _Opened(folder, state, outbox, kept, geometry, robot, write)
+            outbox, write = _bounded(state, robot, map_name, layer, limits)
+        yield _Opened(folder, state, outbox, kept, layer, robot, write)
 
 
-def _unbounded(
-    state: ReplicaState, robot: RobotName, geometry: Geometry, kept: KeptScans
-) -> tuple[Outbox, AmendWriter]:
+def _unbounded(state: ReplicaState, robot: RobotName, layer: MapLayer, kept: KeptScans) -> tuple[Outbox, AmendWriter]:
     """The outbox of a robot whose disk is not bounded, without its map."""
-    outbox = Outbox(state, robot, geometry, make_room=lambda size_bytes: None, amendable=lambda: kept.commits)
+    outbox = Outbox(state, robot, layer, make_room=lambda size_bytes: None, amendable=lambda: kept.commits)
 
     def write(
         target: CommitId,
@@ -229,14 +228,15 @@ def _unbounded(
 
 
 def _bounded(
-    state: ReplicaState, robot: RobotName, map_name: str, geometry: Geometry, limits: Limits
+    state: ReplicaState, robot: RobotName, map_name: str, layer: MapLayer, limits: Limits
 ) -> tuple[Outbox, AmendWriter]:
     """The outbox of a robot whose disk is bounded: amends drop what commits would."""
     replica = Replica(
         state.store,
         robot=robot,
         map_name=map_name,
-        geometry=geometry,
+        geometry=layer.geometry,
+        epoch_s=layer.epoch_s,
         memory_bytes_max=limits.map_bytes_max,
         keep_acked_s=limits.keep_acked_s,
     )
@@ -339,7 +339,7 @@ def _find_lost(opened: _Opened, recipe: Recipe, plan: FolderPlan) -> None:
 def _amend(opened: _Opened, original: CommitId, recipe: Recipe) -> None:
     """Integrate one measurement's scans again, and commit that in its place; in any case all of it or nothing."""
     form = _form(opened, opened.outbox.successors.latest(original))
-    measurement = Measurement(recipe.rig, opened.geometry, recipe.integrator(form.integrator))
+    measurement = Measurement(recipe.rig, opened.layer.geometry, recipe.integrator(form.integrator))
     # Where its last form has them; the kept scans have the poses that were observed.
     recorded = form.record.T_map_rig if form.record else None
     poses, is_moved = [], False

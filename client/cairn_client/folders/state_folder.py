@@ -46,10 +46,11 @@ def opened_replica(folder: Path) -> Iterator[Replica]:
     check_state_folder(folder)
     with closing(ReplicaStore(folder)) as store:
         state = ReplicaState(store)
-        robot, map_name, geometry = state.robot, state.map_name, state.geometry
-        if robot is None or map_name is None or geometry is None:
+        robot, map_name, layer = state.robot, state.map_name, state.layer
+        if robot is None or map_name is None or layer is None:
             raise BadInputError("no_state_folder", f"{folder} was never used; begin with `cairn clone URL {folder}`")
-        yield Replica(store, robot=robot_name(robot), map_name=map_name, geometry=geometry)
+        grid, epoch_s = layer.geometry, layer.epoch_s
+        yield Replica(store, robot=robot_name(robot), map_name=map_name, geometry=grid, epoch_s=epoch_s)
 
 
 def url_of(folder: Path) -> str:

@@ -72,6 +72,8 @@ if TYPE_CHECKING:
     import httpx
 
 PROTOCOL_VERSION = "1"
+FORMAT_VERSION = "2"
+"""Newest version of cells and commits that is read; without it a server takes a client for one of version 1."""
 TIMEOUT_S, CONNECT_S = 30.0, 5.0
 NO_CONTENT, NOT_MODIFIED = 204, 304
 ANSWER_BYTES_MAX = 64 << 20
@@ -427,7 +429,8 @@ class MapApi:
         """Context of an answer that began well and is still to be read; errors come out as a `CairnError`."""
         import httpx
 
-        sent = {"Cairn-Protocol": PROTOCOL_VERSION, "Accept-Encoding": CODING, **(headers or {})}
+        sent = {"Cairn-Protocol": PROTOCOL_VERSION, "Cairn-Format": FORMAT_VERSION, "Accept-Encoding": CODING}
+        sent |= headers or {}
         if self.token:
             sent["Authorization"] = f"Bearer {self.token}"
         if content:

@@ -20,10 +20,12 @@ from cairn_client.sync.requests import (
     hold,
     whole_index,
 )
-from cairn_map.codec.cell_code import DecodedCell, decode_cell
 from cairn_map.codec.cell_reading import EVIDENCE_BYTES_MAX
+from cairn_map.codec.history_code import DecodedHistory
+from cairn_map.codec.layer_code import decode_layer_cell
+from cairn_map.epochs.cell_history import history_fingerprint
+from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import DamagedDataError
-from cairn_map.evidence.fingerprint import fingerprint
 from cairn_map.evidence.grid import CellKey, cell_of_key
 from cairn_map.wire.frames import Frame
 from cairn_map.wire.resumed_replies import Replies
@@ -95,9 +97,9 @@ def cells_with_evidence(api: MapApi, map_name: str) -> list[CellKey]:
 
 
 def download_cell(
-    api: MapApi, map_name: str, key: CellKey, *, evidence_bytes_max: int = EVIDENCE_BYTES_MAX
-) -> tuple[bytes, DecodedCell]:
-    """Bytes of one cell, and the evidence that they decode to.
+    api: MapApi, map_name: str, key: CellKey, layer: MapLayer, *, evidence_bytes_max: int = EVIDENCE_BYTES_MAX
+) -> tuple[bytes, DecodedHistory]:
+    """Bytes of one cell of a map of this layer, and the evidence that they decode to.
 
     Raises:
         BadInputError: kind `too_large`: the evidence would take more bytes than allowed.
@@ -106,7 +108,7 @@ def download_cell(
     cell = cell_of_key(key)
     fetched = api.cell(map_name, cell)
     body = fetched.body or b""
-    decoded = decode_cell(body, evidence_bytes_max=evidence_bytes_max)
-    if decoded.key != key or fingerprint(decoded.evidence, decoded.key) != fetched.fingerprint:
+    decoded = decode_layer_cell(body, key, layer, evidence_bytes_max=evidence_bytes_max)
+    if history_fingerprint(decoded.history, key, layer_word=layer.word) != fetched.fingerprint:
         raise DamagedDataError("fingerprint_mismatch", f"cell {cell} is not what the server says it is")
     return body, decoded

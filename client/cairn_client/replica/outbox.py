@@ -26,15 +26,19 @@ from cairn_client.replica.replica_state import (
     poses_to_text,
 )
 from cairn_client.replica.replica_store import KeptCommit
-from cairn_map.codec.cell_code import Profile, decode_cell
+from cairn_map.codec.cell_code import Profile
+from cairn_map.codec.layer_code import decode_row
 from cairn_map.commits.commit import Commit, CommitMeta, ScanPose, make_commit, renamed_commit, split_commit
 from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.ids import Author, CommitId, RobotName
 from cairn_map.commits.signature import Signature
 from cairn_map.commits.version_vector import EMPTY, VersionVector
+from cairn_map.epochs.cell_history import CellHistory, cell_history
+from cairn_map.epochs.epoch import BASE, Epoch
+from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import BadInputError, ConflictError, DamagedDataError, first_error
 from cairn_map.evidence.evidence import Evidence
-from cairn_map.evidence.grid import CellKey, Geometry
+from cairn_map.evidence.grid import CellKey
 from cairn_map.wire.messages import ReplyHeader
 
 log = logging.getLogger(__name__)
@@ -50,6 +54,8 @@ class CommitFacts:
 
     captured_s: tuple[float, float] | None = None
     """Times of the first and the last scan, UTC seconds since 1970; None for a commit without scans."""
+    epoch: Epoch | None = None
+    """Epoch of the last scan, by the server's clock; None: it has no time by which others could order it."""
     scans: tuple[ScanPose, ...] = ()
     """Poses of the scans, in their order."""
     sensors: tuple[str, ...] = ()
@@ -63,7 +69,7 @@ class CommitFacts:
     note: str = ""
     """Up to 1024 characters for the map's log."""
 
-    def meta(self, commit: CommitId, geometry: Geometry, *, parent: str | None, seen: Cursor | None) -> CommitMeta:
+    def meta(self, commit: CommitId, layer: MapLayer, *, parent: str | None, seen: Cursor | None) -> CommitMeta:
         """The commit's meta.
 
         Raises:
@@ -72,7 +78,9 @@ class CommitFacts:
         try:
             return CommitMeta(
                 id=str(commit),
-                geometry=geometry.digest().hex(),
+                geometry=None if layer.has_epochs else layer.geometry.digest().hex(),
+                layers=layer.identities,
+                epoch=self.epoch if layer.has_epochs and self.epoch != BASE else None,
                 parent=parent,
                 seen=None if seen is None else str(seen),
                 captured_s=self.captured_s,
@@ -97,7 +105,7 @@ class Outbox:
         self,
         state: ReplicaState,
         robot: RobotName,
-        geometry: Geometry,
+        layer: MapLayer,
         *,
         make_room: Callable[[int], None],
         amendable: Callable[[], Iterable[CommitId]],
@@ -107,14 +115,14 @@ class Outbox:
         Args:
             state: the robot's folder.
             robot: its name.
-            geometry: the map's grid.
+            layer: the map's grid and epochs.
             make_room: called before a commit of so many bytes is kept; raises if there is no room for it.
             amendable: returns commits that may still be amended: their bytes are kept, to subtract them at once.
         """
         self._state = state
         self._store = state.store
         self._robot = robot
-        self._geometry = geometry
+        self._layer = layer
         self._make_room = make_room
         self._amendable = amendable
         # Key and incarnation are drawn in one transaction: one without the other makes commits that cannot be signed.
@@ -133,8 +141,8 @@ class Outbox:
         self._acked_since_header: set[CommitId] = set()
         self._retracts: dict[CommitId, tuple[CommitId, ...]] = {}
         """Commits that each kept commit takes out, as far as they were read."""
-        self._read_last: dict[CommitId, tuple[int, dict[CellKey, bytes]]] = {}
-        """Size, and bytes of the cells, of the commits read last, oldest first."""
+        self._read_last: dict[CommitId, tuple[int, Epoch, dict[CellKey, bytes]]] = {}
+        """Size, epoch, and bytes of the cells, of the commits read last, oldest first."""
         self.successors = Successors(self._store)
         self.amends = AmendRecords(self._store)
         for kept in self._store.commits():
@@ -184,8 +192,8 @@ class Outbox:
             raise BadInputError("not_own", f"{foreign[0]} is not {self._robot}'s own; an operator can retract it")
         # Number and parent continue the row of this incarnation, without a gap.
         n = self._next_n()
-        meta = facts.meta(CommitId(self.author, n), self._geometry, parent=self._state.tip_sha, seen=seen)
-        commit = make_commit(meta, diff, self._geometry, profile=profile)
+        meta = facts.meta(CommitId(self.author, n), self._layer, parent=self._state.tip_sha, seen=seen)
+        commit = make_commit(meta, diff, self._layer, profile=profile)
         # Before the transaction, because making room drops things in transactions of its own.
         self._make_room(len(commit.data))
         # All of it or nothing: a commit kept without its number would share its id with the next one.
@@ -233,7 +241,10 @@ class Outbox:
             scans=len(facts.scans),
             poses=None if T_map_rig is None else poses_to_text(T_map_rig),
         )
-        return self.add(diff, replace(facts, retracts=(latest,)), seen=seen, profile=profile, record=record)
+        # The scans are the same: they keep their epoch, even if the clock is known better by now (rule T2).
+        epoch = self._bodies(latest)[0] if self._has_data(latest) else facts.epoch
+        facts = replace(facts, retracts=(latest,), epoch=epoch)
+        return self.add(diff, facts, seen=seen, profile=profile, record=record)
 
     def keep_sealed(self, commit: Commit, seal: str) -> None:
         """Keep a server's own retract, to push it back if the server is restored to a time before it (rule 11)."""
@@ -416,32 +427,37 @@ class Outbox:
         """True if a commit was ever kept here."""
         return commit in self._commits
 
-    def own_evidence(self, key: CellKey, news: VersionVector, author: Author) -> list[Evidence] | None:
+    def own_evidence(self, key: CellKey, news: VersionVector, author: Author) -> list[CellHistory] | None:
         """Evidence of a cell from an author's commits among `news`; None if the bytes of one are not kept any more."""
         mine = [commit for commit in self._touching.get(key, ()) if commit.author == author and commit in news]
         if not all(self._commits[commit].has_data for commit in mine):
             return None
-        return [self.evidence(commit, key) for commit in mine]
+        return [self.history(commit, key) for commit in mine]
 
-    def evidence(self, commit: CommitId, key: CellKey) -> Evidence:
-        """Evidence of one commit for a cell that it touches.
+    def history(self, commit: CommitId, key: CellKey) -> CellHistory:
+        """Evidence of one commit for a cell that it touches, as the row of its epoch.
 
         Raises:
             DamagedDataError: its bytes at rest are not sound any more.
         """
-        return decode_cell(self._bodies(commit)[key]).evidence
+        epoch, bodies = self._bodies(commit)
+        return cell_history({epoch: decode_row(bodies[key], key, self._layer)})
 
-    def _bodies(self, commit: CommitId) -> dict[CellKey, bytes]:
-        """Bytes of the cells of a commit; those of the commits read last stay, for a folder is read cell by cell."""
+    def _has_data(self, commit: CommitId) -> bool:
+        kept = self._commits.get(commit)
+        return kept is not None and kept.has_data
+
+    def _bodies(self, commit: CommitId) -> tuple[Epoch, dict[CellKey, bytes]]:
+        """Epoch of a commit, and bytes of its cells; the commits read last stay, for a folder is read cell by cell."""
         if commit not in self._read_last:
             data = self._store.commit_data(commit) or b""
-            self._read_last[commit] = len(data), split_commit(data)[1]
+            meta, bodies = split_commit(data)
+            self._read_last[commit] = len(data), meta.row, bodies
             # Those read longest ago go first, and the newest one too if it alone is too large.
-            found = self._read_last[commit][1]
-            while sum(size for size, _ in self._read_last.values()) > READ_LAST_BYTES_MAX:
+            while sum(size for size, _, _ in self._read_last.values()) > READ_LAST_BYTES_MAX:
                 del self._read_last[next(iter(self._read_last))]
-            return found
-        return self._read_last[commit][1]
+            return meta.row, bodies
+        return self._read_last[commit][1:]
 
     def _note(self, kept: KeptCommit) -> None:
         # Its bytes may be new ones: a rename changes what an amend names.

@@ -31,9 +31,11 @@ from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.ids import OPERATOR, Author, CommitId, RobotName
 from cairn_map.commits.signature import Signature
 from cairn_map.commits.version_vector import EMPTY
+from cairn_map.epochs.cell_history import CellHistory
+from cairn_map.epochs.history_map import HistoryMap
+from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import BadInputError, CairnError, ConflictError
 from cairn_map.evidence.evidence import Evidence
-from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.fingerprint import Fingerprint
 from cairn_map.evidence.grid import Cell, CellKey, Geometry, cell_of_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
@@ -103,6 +105,7 @@ class Replica:
         robot: RobotName,
         map_name: str,
         geometry: Geometry,
+        epoch_s: int | None = None,
         amendable: Callable[[], Iterable[CommitId]] = tuple,
         memory_bytes_max: int | None = None,
         keep_acked_s: float = KEEP_ACKED_S,
@@ -114,6 +117,7 @@ class Replica:
             robot: its name.
             map_name: name of the map on its server.
             geometry: grid of the map.
+            epoch_s: length of its epochs, seconds; None: it has none.
             amendable: returns commits that may still be amended: their bytes are kept, to subtract them at once.
             memory_bytes_max: size of the view from which on no more cells of the server are read from the disk; None:
                 any.
@@ -125,13 +129,13 @@ class Replica:
         self._lock = threading.RLock()
         self.store = store
         self.state = ReplicaState(store)
-        self.geometry = geometry
+        self.layer = MapLayer(geometry=geometry, epoch_s=epoch_s)
         self._keep_acked_s = keep_acked_s
-        self.state.identify(robot=robot, map_name=map_name, geometry=geometry)
+        self.state.identify(robot=robot, map_name=map_name, layer=self.layer)
         self._budget: StorageBudget | None = None
-        self.outbox = Outbox(self.state, robot, geometry, make_room=self._make_room, amendable=amendable)
+        self.outbox = Outbox(self.state, robot, self.layer, make_room=self._make_room, amendable=amendable)
         self._base = ServerCells(
-            self.state, self.outbox, geometry, admit=self._admit, memory_bytes_max=memory_bytes_max
+            self.state, self.outbox, self.layer, admit=self._admit, memory_bytes_max=memory_bytes_max
         )
         self.header: ReplyHeader | None = self.state.header
         """Newest state that the server reported."""
@@ -156,7 +160,12 @@ class Replica:
             return self.outbox.author
 
     @property
-    def view(self) -> EvidenceMap:
+    def geometry(self) -> Geometry:
+        """Grid of the map."""
+        return self.layer.geometry
+
+    @property
+    def view(self) -> HistoryMap:
         """Evidence that the robot shows; it changes with each commit and each frame."""
         return self._base.view
 
@@ -188,10 +197,14 @@ class Replica:
         with self._lock:
             return {key: cell.fingerprint for key, cell in self._base.cells.items()}
 
-    def base_evidence(self, key: CellKey) -> Evidence:
-        """The server's evidence of a cell; empty if its bytes are damaged, which its fingerprint shows."""
+    def base_history(self, key: CellKey) -> CellHistory:
+        """The server's evidence of a cell; none if its bytes are damaged, which its fingerprint shows."""
         with self._lock:
-            return self._base.evidence(key)
+            return self._base.history(key)
+
+    def base_evidence(self, key: CellKey) -> Evidence:
+        """`base_history`, all rows summed."""
+        return self.base_history(key).total(self.geometry)
 
     def commit(
         self,
@@ -437,9 +450,9 @@ class Replica:
         with self._lock:
             model = self.state.map_model() if model is None else model
             if self._snapshot is not None and self._snapshot.model == model:
-                self._snapshot = self._snapshot.refreshed(self.view)
+                self._snapshot = self._snapshot.refreshed(self.view.base)
             else:
-                self._snapshot = snapshot_of(self.view, model)
+                self._snapshot = snapshot_of(self.view.base, model)
             return self._snapshot
 
     def memory_bytes(self) -> int:

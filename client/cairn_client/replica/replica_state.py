@@ -27,6 +27,7 @@ from cairn_map.commits.commit import Commit
 from cairn_map.commits.cursor import Cursor, cursor_from_text
 from cairn_map.commits.ids import CommitId, Incarnation, RobotName, commit_id_from_text
 from cairn_map.commits.signature import SIGNATURES_MAX, Signature, SigningKey, signatures_to_text
+from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import BadInputError, DamagedDataError
 from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
@@ -110,6 +111,8 @@ class ReplicaState:
     """Name of the map on its server."""
     geometry = _model_field("geometry", Geometry)
     """Grid of the map."""
+    epoch_s = Field("epoch_s", int)
+    """Length of the map's epochs, seconds; None: it has none."""
     url: Field[str] = Field("url", str)
     """Map on its server, `http://HOST:PORT/maps/NAME`."""
     mode: Field[Mode] = Field("mode", TypeAdapter[Mode](Mode).validate_python)
@@ -146,24 +149,32 @@ class ReplicaState:
     def __init__(self, store: ReplicaStore) -> None:
         self.store = store
 
-    def identify(self, *, robot: RobotName, map_name: str, geometry: Geometry) -> None:
+    @property
+    def layer(self) -> MapLayer | None:
+        """Grid and epochs of the map; None before they are known."""
+        return None if self.geometry is None else MapLayer(geometry=self.geometry, epoch_s=self.epoch_s)
+
+    def identify(self, *, robot: RobotName, map_name: str, layer: MapLayer) -> None:
         """Make the folder this robot's, or check that it is.
 
         Raises:
-            BadInputError: kind `other_replica`: it belongs to another robot, map or grid.
+            BadInputError: kind `other_replica`: it belongs to another robot, map or grid, or to one of other epochs.
         """
         identity = {
             ReplicaState.robot.key: robot,
             ReplicaState.map_name.key: map_name,
-            ReplicaState.geometry.key: geometry.model_dump_json(),
+            ReplicaState.geometry.key: layer.geometry.model_dump_json(),
+            ReplicaState.epoch_s.key: None if layer.epoch_s is None else str(layer.epoch_s),
         }
         with self.store.transaction():
+            is_new = self.robot is None
             for key, value in identity.items():
                 known = self.store.get(key)
-                if known is not None and known != value:
+                if known != value and not (known is None and is_new):
                     raise BadInputError(
                         "other_replica",
-                        f"the robot's folder belongs to another {key}: {known[:120]}; choose another (--state)",
+                        f"the robot's folder belongs to another {key}: {(known or 'none')[:120]}; "
+                        "choose another (--state)",
                     )
                 self.store.put(key, value)
 

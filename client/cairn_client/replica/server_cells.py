@@ -14,17 +14,19 @@ from dataclasses import dataclass, replace
 from cairn_client.replica.outbox import Outbox
 from cairn_client.replica.replica_state import ReplicaState
 from cairn_client.replica.replica_store import BaseCell, KeptCommit
-from cairn_map.codec.cell_code import coding_of, decode_cell, encode_cell
+from cairn_map.codec.cell_code import coding_of
+from cairn_map.codec.layer_code import decode_layer_cell, encode_layer_cell, row_bodies
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.ids import CommitId
 from cairn_map.commits.version_vector import EMPTY, VersionVector
+from cairn_map.epochs.cell_history import NOTHING, CellHistory, history_fingerprint, merged, unmerged
+from cairn_map.epochs.history_map import HistoryMap
+from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import CairnError, DamagedDataError
-from cairn_map.evidence.brick_cell import brick_cell
-from cairn_map.evidence.evidence import Evidence, empty_evidence
-from cairn_map.evidence.evidence_map import EvidenceMap
-from cairn_map.evidence.fingerprint import ZERO, fingerprint
-from cairn_map.evidence.grid import CellKey, Geometry, cell_of_key
+from cairn_map.evidence.evidence_map import Diff
+from cairn_map.evidence.fingerprint import ZERO
+from cairn_map.evidence.grid import CellKey, cell_of_key
 
 log = logging.getLogger(__name__)
 
@@ -39,7 +41,7 @@ class ServerCells:
         self,
         state: ReplicaState,
         outbox: Outbox,
-        geometry: Geometry,
+        layer: MapLayer,
         *,
         admit: Callable[[CellKey, int], None],
         memory_bytes_max: int | None = None,
@@ -49,7 +51,7 @@ class ServerCells:
         Args:
             state: the robot's folder.
             outbox: its own commits.
-            geometry: the map's grid.
+            layer: the map's grid and epochs.
             admit: called before a cell of so many bytes is held; raises if there is no room for it.
             memory_bytes_max: size of the view from which on no more cells are read; None: any. The others are to be
                 fetched again where the robot is.
@@ -57,9 +59,9 @@ class ServerCells:
         self._state = state
         self._store = state.store
         self._outbox = outbox
-        self._geometry = geometry
+        self._layer = layer
         self._admit = admit
-        self.view = EvidenceMap(geometry, coding=coding_of(geometry))
+        self.view = HistoryMap(layer, coding=coding_of(layer.geometry))
         """Evidence that the robot shows."""
         self.default_cursor = state.default_cursor
         """Cursor of every cell that is not held."""
@@ -71,7 +73,7 @@ class ServerCells:
                 continue
             body = self._store.body(key)
             base = self._decoded(key, body)
-            if fingerprint(base, key) == cell.fingerprint:
+            if history_fingerprint(base, key, layer_word=layer.word) == cell.fingerprint:
                 self._show(key, base, body)
             else:
                 log.error("cell %s at rest is not what it was; asking for it again", cell_of_key(key))
@@ -88,30 +90,30 @@ class ServerCells:
         """Ids that are in a cell's base."""
         return self.cells[key].coverage if key in self.cells else EMPTY
 
-    def evidence(self, key: CellKey) -> Evidence:
-        """The server's evidence of a cell; empty if its bytes are damaged, which its fingerprint shows."""
+    def history(self, key: CellKey) -> CellHistory:
+        """The server's evidence of a cell; none if its bytes are damaged, which its fingerprint shows."""
         return self._decoded(key, self._store.body(key))
 
-    def _decoded(self, key: CellKey, body: bytes | None) -> Evidence:
+    def _decoded(self, key: CellKey, body: bytes | None) -> CellHistory:
         try:
-            return decode_cell(body).evidence if body else empty_evidence(self._geometry)
+            return decode_layer_cell(body, key, self._layer).history if body else NOTHING
         except CairnError as exc:
             log.error("cell %s at rest is damaged: %s", cell_of_key(key), exc.message)
-            return empty_evidence(self._geometry)
+            return NOTHING
 
-    def hold(self, key: CellKey, cell: BaseCell, evidence: Evidence, *, body: bytes | None = None) -> None:
+    def hold(self, key: CellKey, cell: BaseCell, history: CellHistory, *, body: bytes | None = None) -> None:
         """Make a cell's base this evidence, with its cursor and coverage, in one transaction, and show it."""
-        data = body or encode_cell(key, evidence, self._geometry).data
-        if len(evidence):
+        data = body or encode_layer_cell(key, history, self._layer).data
+        if len(history):
             self._admit(key, len(data))
         with self._store.transaction():
             self._store.put_cell(key, cell, body=data)
         self.cells[key] = cell
-        self._show(key, evidence, data)
+        self._show(key, history, data)
 
     def hold_nothing(self, key: CellKey, cell: BaseCell) -> None:
         """Make a cell's base empty."""
-        self.hold(key, cell, empty_evidence(self._geometry))
+        self.hold(key, cell, NOTHING)
 
     def move(self, keys: Iterable[CellKey], *, to: Cursor | None, coverage: VersionVector | None) -> None:
         """Give held cells another cursor, and coverage unless None; their evidence stays."""
@@ -150,20 +152,23 @@ class ServerCells:
         body = self._store.body(key)
         self._show(key, self._decoded(key, body), body)
 
-    def _show(self, key: CellKey, base: Evidence, body: bytes | None) -> None:
-        shown = shown_evidence(self._outbox, key, base, self._geometry, coverage=self.coverage(key))
-        self.view.replace(key, shown, body=body if shown is base else None, came_bytes=len(body or b""))
+    def _show(self, key: CellKey, base: CellHistory, body: bytes | None) -> None:
+        shown = shown_history(self._outbox, key, base, self._layer, coverage=self.coverage(key))
+        bodies = row_bodies(body, key, self._layer) if body and len(base) and shown is base else {}
+        self.view.replace(key, shown, bodies=bodies, came_bytes=len(body or b""))
 
     def refresh_commits(self, commits: Iterable[CommitId]) -> None:
         """Make the view of all cells that some kept commits touch their base, changed by the commits that are kept."""
         for key in {key for commit in commits if (kept := self._outbox.kept(commit)) for key in kept.cells}:
             self.refresh(key)
 
-    def show_commit(self, commit: Commit, diff: dict[CellKey, Evidence]) -> None:
+    def show_commit(self, commit: Commit, diff: Diff) -> None:
         """Add a commit that was just kept to the view, and take out what it takes out."""
-        self.view.merge(diff, bodies=commit.cells)
-        for gone in taken_back(self._outbox, commit, self._geometry, coverage_of=self.coverage):
-            self.view.unmerge(gone)
+        self.view.merge(diff, epoch=commit.meta.row, bodies=commit.cells)
+        for key, gone in taken_back(self._outbox, commit, coverage_of=self.coverage):
+            # A retract takes evidence out of the rows in which it lies, those of its own epoch (rule T6).
+            for epoch, evidence in gone.rows.items():
+                self.view.unmerge({key: evidence}, epoch=epoch)
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,30 +188,29 @@ def changes(outbox: Outbox, key: CellKey, coverage: VersionVector) -> Changes:
     )
 
 
-def shown_evidence(
-    outbox: Outbox, key: CellKey, base: Evidence, geometry: Geometry, *, coverage: VersionVector
-) -> Evidence:
+def shown_history(
+    outbox: Outbox, key: CellKey, base: CellHistory, layer: MapLayer, *, coverage: VersionVector
+) -> CellHistory:
     """Evidence of a cell in the view: its base, changed by the commits in the outbox that its coverage lacks."""
     found = changes(outbox, key, coverage)
     if not found.added and not found.taken:
         return base
-    cell = brick_cell(geometry, [base])
-    for commit in found.added:
-        cell.merge(_sound_evidence(outbox, commit, key, geometry))
+    shown = merged([base, *(_sound_evidence(outbox, commit, key) for commit in found.added)], layer.geometry)
     for commit in found.taken:
-        cell.unmerge(_sound_evidence(outbox, commit, key, geometry))
-    return cell.packed()
+        shown = unmerged(shown, _sound_evidence(outbox, commit, key), layer.geometry)
+    return shown
 
 
 def taken_back(
-    outbox: Outbox, by: Commit, geometry: Geometry, *, coverage_of: Callable[[CellKey], VersionVector]
-) -> Iterator[dict[CellKey, Evidence]]:
-    """Evidence that leaves the view once a commit is in the outbox, for each commit that it takes out."""
+    outbox: Outbox, by: Commit, *, coverage_of: Callable[[CellKey], VersionVector]
+) -> Iterator[tuple[CellKey, CellHistory]]:
+    """Evidence that leaves the view once a commit is in the outbox, for each cell of each commit that it takes out."""
     for target in by.meta.retracted_ids:
         kept = outbox.kept(target)
         if kept is not None and outbox.successors.of(target) == by.id:
-            shown = [key for key in kept.cells if kept.acked or target not in coverage_of(key)]
-            yield {key: _sound_evidence(outbox, target, key, geometry) for key in shown}
+            for key in kept.cells:
+                if kept.acked or target not in coverage_of(key):
+                    yield key, _sound_evidence(outbox, target, key)
 
 
 def is_to_be_taken(outbox: Outbox, commit: CommitId, *, coverage_of: Callable[[CellKey], VersionVector]) -> bool:
@@ -235,10 +239,10 @@ def _is_due(outbox: Outbox, kept: KeptCommit, coverage: VersionVector) -> bool:
     return is_there and by is not None and by not in coverage and outbox.kept(by) is not None
 
 
-def _sound_evidence(outbox: Outbox, commit: CommitId, key: CellKey, geometry: Geometry) -> Evidence:
-    """Evidence of a kept commit for a cell; empty, with a line in the log, if the disk damaged it."""
+def _sound_evidence(outbox: Outbox, commit: CommitId, key: CellKey) -> CellHistory:
+    """Evidence of a kept commit for a cell; none, with a line in the log, if the disk damaged it."""
     try:
-        return outbox.evidence(commit, key)
+        return outbox.history(commit, key)
     except DamagedDataError as exc:
         log.error("commit %s at rest is damaged and left out of cell %s: %s", commit, cell_of_key(key), exc.message)
-        return empty_evidence(geometry)
+        return NOTHING

@@ -154,11 +154,11 @@ class Membership:
         return Register(robot=author.robot, mode=self._mode, incarnation=author.incarnation, sensors=self._sensors)
 
     def _keep(self, registered: Registered) -> None:
-        if registered.map.geometry != self._replica.geometry:
+        if registered.map.layer != self._replica.layer:
             raise BadInputError(
                 "other_geometry",
-                f"map {self._map_name} has {registered.map.geometry}; this robot's directory has "
-                f"{self._replica.geometry}. Its {len(self._replica.push_set())} waiting commits stay there: push them "
+                f"map {self._map_name} has {registered.map.layer}; this robot's directory has "
+                f"{self._replica.layer}. Its {len(self._replica.push_set())} waiting commits stay there: push them "
                 "to a map with their grid, and give the robot another directory for this map",
             )
         state = self._replica.state

@@ -49,8 +49,9 @@ from cairn_fusion.recording.scan import Scan
 from cairn_map.codec.cell_code import Profile
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.ids import CommitId, robot_name
+from cairn_map.epochs.history_map import HistoryMap
+from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import BadInputError, CairnError
-from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.grid import Geometry, cell_of_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.kernels.numba_runtime import show_compiling
@@ -76,7 +77,7 @@ class Robot:
         token: enrolment (or admin) token, or the robot's own; not needed where the server trusts this machine.
         mode: high-end keeps the whole map and fetches differences; low-end fetches whole cells; a viewer pushes
             nothing.
-        geometry: grid of the map, to start without a link; otherwise the server is asked once.
+        geometry: grid of the map, or its grid and epochs, to start without a link; otherwise the server is asked once.
         integrator: range limits.
         scope: cells to fetch, and the size of one reply.
         limits: how much to keep on the disk and in memory, and what is dropped first when that is full; None: the
@@ -97,7 +98,7 @@ class Robot:
         name: str,
         token: str | None = None,
         mode: Mode = "high-end",
-        geometry: Geometry | None = None,
+        geometry: Geometry | MapLayer | None = None,
         integrator: Integrator | None = None,
         scope: Scope = EVERYTHING,
         limits: Limits | None = None,
@@ -144,23 +145,27 @@ class Robot:
             self._measurement = self._new_measurement()
             opened.pop_all()  # from here on `close` does it
 
-    def _open_replica(self, directory: Path, geometry: Geometry | None, limits: Limits | None) -> Replica:
+    def _open_replica(self, directory: Path, geometry: Geometry | MapLayer | None, limits: Limits | None) -> Replica:
         """The directory's state; its grid is the given one, else the remembered one, else the server's."""
         store = ReplicaStore(directory)
         try:
             state = ReplicaState(store)
             self._limits = limits or state.limits or STANDARD_LIMITS
-            geometry = geometry or state.geometry
+            layer = geometry if isinstance(geometry, MapLayer) else state.layer
+            # A given grid alone is that of a map without epochs, unless the folder knows better.
+            if isinstance(geometry, Geometry):
+                layer = MapLayer(geometry=geometry, epoch_s=state.epoch_s)
             # The one question that cannot wait for a link: without a grid no evidence has a place.
-            if geometry is None:
+            if layer is None:
                 info = self._api.map_info(self._map_name)
-                geometry = info.geometry
+                layer = info.layer
                 state.note_model(info.sensor_model)
             replica = Replica(
                 store,
                 robot=self.name,
                 map_name=self._map_name,
-                geometry=geometry,
+                geometry=layer.geometry,
+                epoch_s=layer.epoch_s,
                 amendable=self._amendable_commits,
                 memory_bytes_max=self._limits.map_bytes_max,
                 keep_acked_s=self._limits.keep_acked_s,
@@ -234,7 +239,7 @@ class Robot:
         return self._status
 
     @property
-    def map(self) -> EvidenceMap:
+    def map(self) -> HistoryMap:
         """The robot's view: the server's map as far as it is here, and its own commits.
 
         The thread that commits may read it at any time; any other thread takes a `snapshot`.

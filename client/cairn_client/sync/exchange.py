@@ -19,13 +19,11 @@ from cairn_client.replica.replica import Replica
 from cairn_client.replica.replica_store import BaseCell
 from cairn_client.replica.server_cells import UNPROVEN, ServerCells
 from cairn_client.sync.requests import Box
-from cairn_map.codec.cell_code import decode_cell
+from cairn_map.codec.layer_code import decode_layer_cell
 from cairn_map.commits.version_vector import EMPTY
+from cairn_map.epochs.cell_history import NOTHING, CellHistory, history_fingerprint, merged
 from cairn_map.errors import DamagedDataError
-from cairn_map.evidence.blocks import without_blocks
-from cairn_map.evidence.brick_cell import sum_evidence
-from cairn_map.evidence.evidence import Evidence, empty_evidence
-from cairn_map.evidence.fingerprint import ZERO, fingerprint
+from cairn_map.evidence.fingerprint import ZERO, Fingerprint
 from cairn_map.evidence.grid import Cell, CellKey, cell_of_key
 from cairn_map.wire.frames import CellFrame, Frame, FrameKind
 from cairn_map.wire.messages import Done, MissingRequest, More, ReplyHeader
@@ -162,13 +160,13 @@ class Exchange:
                 self._ask_whole(base, frame.cell, exc.message)
 
     def _apply_full(self, base: ServerCells, frame: CellFrame) -> None:
-        evidence = self._payload(frame)
-        if fingerprint(evidence, frame.cell) != frame.fingerprint:
+        history = self._payload(frame)
+        if self._fingerprint(history, frame.cell) != frame.fingerprint:
             raise DamagedDataError("fingerprint_mismatch", "it came whole, but not with its fingerprint")
-        base.hold(frame.cell, self._at_head(frame), evidence, body=frame.payload)
+        base.hold(frame.cell, self._at_head(frame), history, body=frame.payload)
 
     def _apply_delta(self, base: ServerCells, frame: CellFrame) -> None:
-        own: list[Evidence] | None = []
+        own: list[CellHistory] | None = []
         # Rule 6: own commits between the two vectors are left out of the sum, so they are added from here.
         if frame.own_excluded:
             news = self._coverage.minus(base.coverage(frame.cell))
@@ -176,15 +174,16 @@ class Exchange:
         if own is None:
             self._ask_whole(base, frame.cell, "own commits that a delta leaves out are not kept any more")
             return
-        before = base.evidence(frame.cell)
-        self._hold_if_sound(base, frame, sum_evidence([before, *own, self._payload(frame)], self._replica.geometry))
+        before = base.history(frame.cell)
+        self._hold_if_sound(base, frame, merged([before, *own, self._payload(frame)], self._replica.geometry))
 
     def _apply_state(self, base: ServerCells, frame: CellFrame) -> None:
-        before = base.evidence(frame.cell)
+        before = base.history(frame.cell)
         blocks = frame.blocks if frame.blocks is not None else np.empty(0, np.uint32)
-        # The blocks of the mask are replaced whole: where the payload has no voxel, there is none any more (rule 4).
-        kept = without_blocks(before, blocks)
-        self._hold_if_sound(base, frame, sum_evidence([kept, self._payload(frame)], self._replica.geometry))
+        # The blocks of the mask are replaced whole, in all rows (rule T3): where the payload has no voxel, there is
+        # none any more (rule 4).
+        kept = before.without_blocks(blocks)
+        self._hold_if_sound(base, frame, merged([kept, self._payload(frame)], self._replica.geometry))
 
     def _apply_reset(self, base: ServerCells, frame: CellFrame) -> None:
         held = base.cells.get(frame.cell)
@@ -216,21 +215,19 @@ class Exchange:
         self._replica.forget_stable_commits()
         self.is_done = True
 
-    def _payload(self, frame: CellFrame) -> Evidence:
+    def _payload(self, frame: CellFrame) -> CellHistory:
         # Nothing to add, or no block that still holds evidence.
-        if not frame.payload:
-            return empty_evidence(self._replica.geometry)
-        cell = decode_cell(frame.payload)
-        if cell.key != frame.cell or cell.geometry != self._replica.geometry:
-            raise DamagedDataError("bad_frame", f"the frame of cell {cell_of_key(frame.cell)} holds another cell")
-        return cell.evidence
+        return decode_layer_cell(frame.payload, frame.cell, self._replica.layer).history if frame.payload else NOTHING
+
+    def _fingerprint(self, history: CellHistory, key: CellKey) -> Fingerprint:
+        return history_fingerprint(history, key, layer_word=self._replica.layer.word)
 
     def _at_head(self, frame: CellFrame) -> BaseCell:
         return BaseCell(frame.to_cursor, self._coverage, frame.fingerprint)
 
-    def _hold_if_sound(self, base: ServerCells, frame: CellFrame, evidence: Evidence) -> None:
-        if fingerprint(evidence, frame.cell) == frame.fingerprint:
-            base.hold(frame.cell, self._at_head(frame), evidence)
+    def _hold_if_sound(self, base: ServerCells, frame: CellFrame, history: CellHistory) -> None:
+        if self._fingerprint(history, frame.cell) == frame.fingerprint:
+            base.hold(frame.cell, self._at_head(frame), history)
         else:
             self._ask_whole(base, frame.cell, MISFIT)
 

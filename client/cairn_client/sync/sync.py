@@ -28,10 +28,11 @@ from cairn_client.sync.requests import (
     whole_index,
 )
 from cairn_client.sync.uploads import PARTS, Parts, push_whole_or_in_parts
-from cairn_map.codec.cell_code import decode_cell, encode_cell
+from cairn_map.codec.layer_code import decode_layer_cell, encode_layer_cell
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.commit_reading import validated_commit
 from cairn_map.commits.ids import Author, CommitId
+from cairn_map.epochs.cell_history import history_fingerprint
 from cairn_map.errors import (
     BadInputError,
     CairnError,
@@ -40,7 +41,7 @@ from cairn_map.errors import (
     DeniedError,
     UnreachableError,
 )
-from cairn_map.evidence.fingerprint import ZERO, fingerprint
+from cairn_map.evidence.fingerprint import ZERO
 from cairn_map.evidence.grid import Cell, CellKey, cell_key, cell_of_key
 from cairn_map.wire.frames import CellFrame
 
@@ -235,11 +236,11 @@ def _sound_body(replica: Replica, key: CellKey, wanted: str) -> bytes | None:
         held = base.cells.get(key)
         if held is None or held.fingerprint.hex() != wanted:
             return None
-        evidence = base.evidence(key)
+        history = base.history(key)
     # Outside the lock, because the sum takes long; the evidence was decoded for this call alone.
-    if fingerprint(evidence, key).hex() != wanted:
+    if history_fingerprint(history, key, layer_word=replica.layer.word).hex() != wanted:
         return None
-    return encode_cell(key, evidence, replica.geometry).data
+    return encode_layer_cell(key, history, replica.layer).data
 
 
 def fetch_missing(
@@ -377,12 +378,11 @@ def fetch_cell(replica: Replica, cell: Cell) -> Conversation[int]:
             base.move([key], to=fetched.cursor, coverage=fetched.coverage)
             return 0
         # It is held only if it is the cell that was asked for, with the fingerprint that the server states.
-        decoded = decode_cell(fetched.body or b"")
-        is_ours = decoded.key == key and decoded.geometry == replica.geometry
-        if not is_ours or fingerprint(decoded.evidence, key) != fetched.fingerprint:
+        history = decode_layer_cell(fetched.body or b"", key, replica.layer).history
+        if history_fingerprint(history, key, layer_word=replica.layer.word) != fetched.fingerprint:
             raise DamagedDataError("fingerprint_mismatch", f"cell {cell} is not what the server says it is")
         cell_here = BaseCell(fetched.cursor, fetched.coverage, fetched.fingerprint, fetched.etag)
-        base.hold(key, cell_here, decoded.evidence, body=fetched.body)
+        base.hold(key, cell_here, history, body=fetched.body)
         return len(fetched.body or b"")
 
 

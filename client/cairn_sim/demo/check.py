@@ -6,13 +6,14 @@ from collections.abc import Callable, Sequence
 from cairn_client.http.api import MapApi
 from cairn_client.http.http_link import index_of
 from cairn_client.robot.robot import Robot
-from cairn_map.codec.cell_code import cell_digest, decode_cell
+from cairn_map.codec.cell_code import decode_cell
+from cairn_map.codec.layer_code import encode_layer_cell
 from cairn_map.commits.commit import split_commit
 from cairn_map.commits.ids import CommitId
+from cairn_map.epochs.cell_history import CellHistory, history_fingerprint
+from cairn_map.epochs.history_map import HistoryMap
+from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import DamagedDataError, UnreachableError
-from cairn_map.evidence.evidence import Evidence
-from cairn_map.evidence.evidence_map import EvidenceMap
-from cairn_map.evidence.fingerprint import fingerprint
 from cairn_map.evidence.grid import CellKey, cell_key
 
 LEVEL_WITHIN_S = 30.0
@@ -43,9 +44,9 @@ def server_identity(api: MapApi, map_name: str) -> dict[CellKey, Identity]:
     return {cell_key(entry.cell): (entry.digest, entry.fingerprint) for entry in cells if entry.voxels}
 
 
-def map_identity(view: EvidenceMap) -> dict[CellKey, Identity]:
+def map_identity(view: HistoryMap) -> dict[CellKey, Identity]:
     """Each cell of a map in memory that holds evidence."""
-    return {key: _identity(key, evidence, view) for key, evidence in view.packed().items()}
+    return {key: _identity(key, history, view.layer) for key in view if len(history := view.history(key))}
 
 
 def require_equal(identities: dict[str, dict[CellKey, Identity]]) -> int:
@@ -62,14 +63,15 @@ def require_equal(identities: dict[str, dict[CellKey, Identity]]) -> int:
     return len(first)
 
 
-def map_without(robots: Sequence[Robot], left_out: CommitId) -> EvidenceMap:
+def map_without(robots: Sequence[Robot], left_out: CommitId) -> HistoryMap:
     """The sum of all commits that the robots keep but one: a map that never had it."""
-    view = EvidenceMap(robots[0].replica.geometry)
+    view = HistoryMap(robots[0].replica.layer)
     for robot in robots:
         for commit in robot.replica.commits:
             data = robot.replica.commit_data(commit)
             if commit != left_out and data is not None:
-                view.merge({key: decode_cell(body).evidence for key, body in split_commit(data)[1].items()})
+                meta, bodies = split_commit(data)
+                view.merge({key: decode_cell(body).evidence for key, body in bodies.items()}, epoch=meta.row)
     return view
 
 
@@ -86,5 +88,6 @@ def wait_for_fold(api: MapApi, map_name: str, is_folded: Callable[[set[str]], bo
         time.sleep(0.05)
 
 
-def _identity(key: CellKey, evidence: Evidence, view: EvidenceMap) -> Identity:
-    return cell_digest(key, evidence, view.geometry).hex(), fingerprint(evidence, key).hex()
+def _identity(key: CellKey, history: CellHistory, layer: MapLayer) -> Identity:
+    found = history_fingerprint(history, key, layer_word=layer.word)
+    return encode_layer_cell(key, history, layer).digest.hex(), found.hex()

@@ -8,11 +8,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 
-from cairn_map.codec.cell_code import EncodedCell, Profile, decode_cell, encode_cell, encode_empty_cell
+from cairn_map.codec.cell_code import (
+    EncodedCell,
+    Profile,
+    decode_canonical_cell,
+    decode_cell,
+    encode_cell,
+    encode_empty_cell,
+)
 from cairn_map.codec.cell_reading import EVIDENCE_BYTES_MAX
+from cairn_map.codec.history_code import VERSION as HISTORY_VERSION
 from cairn_map.codec.history_code import (
     DecodedHistory,
     HistoryFile,
+    check_canonical_history,
     decode_history,
     encode_history,
     history_digest,
@@ -77,6 +86,21 @@ def decode_layer_cell(
     return found
 
 
+def decode_canonical_layer_cell(data: bytes) -> DecodedHistory:
+    """A cell of whatever map, refused if a row is not the canonical coding of its evidence.
+
+    Raises:
+        DamagedDataError: kind `not_canonical`, or cut off, contradictory or out of range.
+        BadInputError: another version, or too large.
+    """
+    if data[4:5] == bytes([HISTORY_VERSION]):
+        check_canonical_history(data)
+        return decode_history(data)
+    cell = decode_canonical_cell(data)
+    history = cell_history({BASE: cell.evidence})
+    return DecodedHistory(cell.key, MapLayer(geometry=cell.geometry), history, cell.digest)
+
+
 def decode_row(data: bytes, key: CellKey, layer: MapLayer) -> Evidence:
     """Evidence of one row, or of a commit's cell.
 
@@ -104,7 +128,7 @@ def read_cell(data: bytes, key: CellKey, layer: MapLayer) -> HistoryCell:
         DamagedDataError, BadInputError: as `decode_layer_cell`.
     """
     cell = HistoryCell(key, layer, row_coding(layer))
-    for epoch, body in _split(data, key, layer).items():
+    for epoch, body in row_bodies(data, key, layer).items():
         decoded = decode_cell(body)
         _check_is(decoded.key, MapLayer(geometry=decoded.geometry), key, MapLayer(geometry=layer.geometry))
         if len(decoded.evidence):
@@ -159,8 +183,12 @@ def _coded(key: CellKey, epoch: Epoch, evidence: Evidence, encoded: EncodedCell,
     )
 
 
-def _split(data: bytes, key: CellKey, layer: MapLayer) -> Mapping[Epoch, bytes]:
-    """Rows of a cell's bytes, each as a cell file of version 1."""
+def row_bodies(data: bytes, key: CellKey, layer: MapLayer) -> Mapping[Epoch, bytes]:
+    """Rows of a cell's bytes, each as a cell file of version 1; none is decoded.
+
+    Raises:
+        DamagedDataError, BadInputError: as `decode_layer_cell`.
+    """
     if not layer.has_epochs:
         return {BASE: data}
     file = split_history(data)
@@ -177,5 +205,5 @@ def _base_of(history: CellHistory, layer: MapLayer) -> Evidence:
 def _check_is(key: CellKey, layer: MapLayer, wanted: CellKey, of: MapLayer) -> None:
     if key != wanted or layer != of:
         raise DamagedDataError(
-            "bad_cell", f"expected cell {cell_of_key(wanted)} of {of!r}, got cell {cell_of_key(key)} of {layer!r}"
+            "bad_cell", f"expected cell {cell_of_key(wanted)} with {of}, got cell {cell_of_key(key)} with {layer}"
         )

@@ -15,6 +15,7 @@ import numpy as np
 
 from cairn_map.epochs.epoch import BASE, Epoch, check_epoch
 from cairn_map.errors import BadInputError
+from cairn_map.evidence.blocks import Blocks, of_blocks, without_blocks
 from cairn_map.evidence.brick_cell import difference, sum_evidence
 from cairn_map.evidence.evidence import Evidence, empty_evidence
 from cairn_map.evidence.evidence_kernels import cell_seeds, epoch_seeds
@@ -58,6 +59,14 @@ class CellHistory:
     def total(self, geometry: Geometry) -> Evidence:
         """Sum of all rows (rule T5): what a map without epochs would hold of the same commits."""
         return sum_evidence(self.rows.values(), geometry)
+
+    def of_blocks(self, blocks: Blocks) -> "CellHistory":
+        """Rows of the voxels in some blocks."""
+        return cell_history({epoch: of_blocks(row, blocks) for epoch, row in self.rows.items()})
+
+    def without_blocks(self, blocks: Blocks) -> "CellHistory":
+        """Rows of the voxels outside of some blocks."""
+        return cell_history({epoch: without_blocks(row, blocks) for epoch, row in self.rows.items()})
 
     def until(self, epoch: Epoch) -> "CellHistory":
         """Rows up to an epoch, which is included: what had been captured then."""

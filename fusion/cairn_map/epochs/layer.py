@@ -49,6 +49,10 @@ class MapLayer(BaseModel, frozen=True):
     """Length of an epoch, seconds; None: one sum for all times, in the bytes of format version 1."""
     name: LayerName = EVIDENCE
 
+    def __str__(self) -> str:
+        """Such as `voxels of 0.04 m, cells of 128^3, channels colour, temperature, epochs of 120 s`."""
+        return f"{self.geometry}, epochs of {self.epoch_s} s" if self.epoch_s is not None else str(self.geometry)
+
     @property
     def has_epochs(self) -> bool:
         """True if evidence is kept by epoch, in the bytes of format version 2."""

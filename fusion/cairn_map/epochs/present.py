@@ -15,9 +15,11 @@ import numpy.typing as npt
 
 from cairn_map.arrays import Floats
 from cairn_map.epochs.cell_history import CellHistory
-from cairn_map.epochs.epoch import Epoch
+from cairn_map.epochs.epoch import BASE, Epoch
+from cairn_map.epochs.layer import MapLayer
 from cairn_map.epochs.present_kernels import add_counts_into, join_samples_into
 from cairn_map.evidence.channels import Channel, ChannelKind, planes_and_squares
+from cairn_map.evidence.evidence import Evidence, empty_evidence
 from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel, log_odds
 
@@ -113,3 +115,18 @@ def _sigmas(channels: tuple[Channel, ...]) -> Floats:
 def _epochs_of(numbers: npt.NDArray[np.int32], epochs: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     """Epochs of rows' numbers; the base for -1."""
     return np.concatenate([epochs, [np.iinfo(np.int64).min]])[numbers]
+
+
+def shown_evidence(history: CellHistory, layer: MapLayer, model: SensorModel, *, at: Epoch | None = None) -> Evidence:
+    """Evidence of a cell as it is read: its sums in a map without epochs, else the reading of its rows.
+
+    Args:
+        history: its rows, of which no number is negative.
+        layer: the map's.
+        model: inverse sensor model of the reading.
+        at: last epoch that is read; None: all are.
+    """
+    if not layer.has_epochs:
+        return history.rows.get(BASE) or empty_evidence(layer.geometry)
+    read = present(history, layer.geometry, model, at=at)
+    return Evidence(read.voxels, read.counts.astype(np.int32), read.sampled, read.samples)

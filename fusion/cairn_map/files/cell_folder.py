@@ -10,11 +10,14 @@ import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from cairn_map.codec.cell_code import DecodedCell, decode_canonical_cell
 from cairn_map.codec.cell_reading import CELL_BYTES_MAX
+from cairn_map.codec.history_code import DecodedHistory
+from cairn_map.codec.layer_code import decode_canonical_layer_cell
+from cairn_map.epochs.layer import EpochLength, MapLayer
 from cairn_map.errors import BadInputError, DamagedDataError, first_error
 from cairn_map.evidence.grid import Cell, CellKey, Geometry, cell_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
@@ -25,12 +28,19 @@ CELL_NAME = re.compile(r"(-?[0-9]{1,7})_(-?[0-9]{1,7})_(-?[0-9]{1,7})\.cell")
 
 
 class FolderHead(BaseModel):
-    """Contents of `map.json`: the geometry and the sensor model of all cells."""
+    """Contents of `map.json`: the geometry, the length of epochs, and the sensor model of all cells."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     geometry: Geometry
     sensor_model: SensorModel = SensorModel()
+    epoch_s: Annotated[EpochLength | None, Field(exclude_if=lambda value: value is None)] = None
+    """Seconds; None: one sum for all times."""
+
+    @property
+    def layer(self) -> MapLayer:
+        """Definition of the cells' evidence."""
+        return MapLayer(geometry=self.geometry, epoch_s=self.epoch_s)
 
 
 def write_head(folder: Path, head: FolderHead) -> None:
@@ -40,7 +50,7 @@ def write_head(folder: Path, head: FolderHead) -> None:
         BadInputError: kind `other_map`: the folder holds a map with another grid.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    if (folder / MAP_FILE).exists() and read_head(folder).geometry != head.geometry:
+    if (folder / MAP_FILE).exists() and read_head(folder).layer != head.layer:
         raise BadInputError("other_map", f"{folder} holds a map with another grid; choose another folder")
     _write(folder / MAP_FILE, head.model_dump_json(indent=1).encode())
 
@@ -71,7 +81,7 @@ def read_head(folder: Path) -> FolderHead:
         raise BadInputError("no_map_folder", f"{path} does not describe a map: {first_error(exc)}") from exc
 
 
-def read_cells(folder: Path, geometry: Geometry) -> Iterator[DecodedCell]:
+def read_cells(folder: Path, layer: MapLayer) -> Iterator[DecodedHistory]:
     """The cells of a folder, each validated, in order of their numbers.
 
     Raises:
@@ -81,12 +91,12 @@ def read_cells(folder: Path, geometry: Geometry) -> Iterator[DecodedCell]:
     for key, path in sorted(_named_cells(folder)):
         data = _read(path, CELL_BYTES_MAX, kind="bad_cell")
         try:
-            decoded = decode_canonical_cell(data)
+            decoded = decode_canonical_layer_cell(data)
         except (DamagedDataError, BadInputError) as exc:
             raise type(exc)(exc.kind, f"{path}: {exc.message}") from exc
         if decoded.key != key:
             raise DamagedDataError("bad_cell", f"{path} holds another cell than its name says")
-        if decoded.geometry != geometry:
+        if decoded.layer != layer:
             raise BadInputError("other_geometry", f"{path} was made for another grid than {folder / MAP_FILE} says")
         yield decoded
 

@@ -12,6 +12,7 @@ from cairn_map.commits.commit import ScanPose
 from cairn_map.commits.cursor import Cursor, cursor_from_text
 from cairn_map.commits.ids import NUMBER_LIMIT, commit_id_from_text
 from cairn_map.commits.version_vector import AUTHORS_MAX, VersionVector, version_vector_from_json
+from cairn_map.epochs.layer import EpochLength, MapLayer
 from cairn_map.errors import DamagedDataError, first_error
 from cairn_map.evidence.fingerprint import Fingerprint, fingerprint_from_hex
 from cairn_map.evidence.grid import Geometry, cell_key
@@ -32,6 +33,9 @@ FingerprintText = Annotated[str, Field(pattern=r"^[0-9a-f]{32}$")]
 ShaText = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 NameText = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,31}$")]
 IdText = Annotated[str, Field(max_length=96)]
+# Absent, not null or 0, where there are no epochs: programs of before refuse fields that they do not know.
+EpochLengthOrNone = Annotated[EpochLength | None, Field(exclude_if=lambda value: value is None)]
+HistoryBytes = Annotated[Count, Field(exclude_if=lambda value: not value)]
 # Fail fast, else a few megabytes of wrong intervals become gigabytes of error messages.
 Interval = Annotated[list[int], Field(min_length=2, max_length=2), FailFast()]
 VectorJson = Annotated[dict[str, Annotated[list[Interval], FailFast()]], Field(max_length=AUTHORS_MAX)]
@@ -99,6 +103,8 @@ class CreateMap(_Model):
 
     geometry: Geometry = Geometry()
     sensor_model: SensorModel = SensorModel()
+    epoch_s: EpochLengthOrNone = None
+    """Length of an epoch, seconds; None: one sum for all times."""
 
 
 class MapInfo(_Model):
@@ -117,6 +123,15 @@ class MapInfo(_Model):
     """Lowest and highest corner of the cells that hold evidence; None while the map is empty."""
     server_key: ShaText | None = None
     """Public key of the server's own commits on this map, in hex: the argument of `--trust-server`."""
+    epoch_s: EpochLengthOrNone = None
+    """Length of an epoch, seconds; None: one sum for all times."""
+    history_bytes: HistoryBytes = 0
+    """Bytes, of `size_bytes`, of evidence older than the newest epoch of its cell."""
+
+    @property
+    def layer(self) -> MapLayer:
+        """Definition of the map's evidence: the grid and the length of an epoch."""
+        return MapLayer(geometry=self.geometry, epoch_s=self.epoch_s)
 
 
 class Register(_Model):

@@ -103,7 +103,7 @@ def check_all_or_none(folder: Path, api: MapApi) -> CairnError | None:
         with pytest.raises(NotFoundError):
             api.map_info(name)
         return exc
-    assert cells == added == len(list(read_cells(folder, read_head(folder).geometry)))
+    assert cells == added == len(list(read_cells(folder, read_head(folder).layer)))
     return None
 
 

@@ -11,6 +11,7 @@ from cairn_client.cli.maps import map_export
 from cairn_client.cli.maps.command import main
 from cairn_client.http.api import MapApi
 from cairn_client.sync.responses import error_of
+from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import BadInputError, DamagedDataError
 from cairn_map.evidence.grid import cell_of_key
 from cairn_map.files.cell_folder import read_cells
@@ -49,7 +50,7 @@ def test_a_cell_is_written_before_the_next_one_is_asked_for(
         main(["export", server.map_url, "--cells", str(folder)])
     first = cell_of_key(min(A, B))
     assert written == [[], [f"{first.i}_{first.j}_{first.k}.cell"]]
-    assert [cell.key for cell in read_cells(folder, GEOMETRY)] == [min(A, B)]
+    assert [cell.key for cell in read_cells(folder, MapLayer(geometry=GEOMETRY))] == [min(A, B)]
 
 
 def test_a_robots_note_and_a_servers_detail_do_not_steer_the_terminal(

@@ -20,6 +20,7 @@ from tests.fixtures.sim.pages import read_page
 
 from cairn_fusion.mapping.integrate import Integrator, Method, integrate_scans
 from cairn_map.codec.cell_code import DecodedCell, encode_cell
+from cairn_map.epochs.epoch import BASE
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.inverse_sensor_model import SensorModel
@@ -56,7 +57,8 @@ def report(folder: Path) -> Json:
 
 
 def cells_of(folder: Path) -> list[DecodedCell]:
-    return list(read_cells(folder, read_head(folder).geometry))
+    cells = read_cells(folder, read_head(folder).layer)
+    return [DecodedCell(cell.key, cell.layer.geometry, cell.history.rows[BASE], cell.digest) for cell in cells]
 
 
 def of_resolutions(folder: Path, report: Json) -> Iterator[tuple[Json, list[DecodedCell]]]:

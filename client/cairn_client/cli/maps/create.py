@@ -14,7 +14,8 @@ from cairn_client.cli.arguments import Subparsers, add_map_parser, api_of, say, 
 from cairn_client.cli.maps.map_export import fetch_map
 from cairn_client.http.api import MapApi
 from cairn_client.http.origin_tokens import NO_TOKENS, OriginTokens
-from cairn_map.codec.cell_code import DecodedCell
+from cairn_map.codec.cell_code import DecodedCell, cell_digest
+from cairn_map.codec.history_code import DecodedHistory
 from cairn_map.commits.commit import Commit, CommitMeta, make_commit
 from cairn_map.commits.ids import INITIAL, Author, CommitId, Incarnation
 from cairn_map.errors import BadInputError
@@ -117,15 +118,15 @@ def _open(source: str, tokens: OriginTokens) -> tuple[FolderHead, Iterable[Decod
         _check_folder(folder)
         head = read_head(folder)
         # All of it is read before the map is made: a damaged file must not leave a part of a map behind.
-        for group in _groups(read_cells(folder, head.geometry)):
+        for group in _groups(_totals(read_cells(folder, head.layer))):
             try:
                 _commit(CHECKED, group, head.geometry)
             except BadInputError as exc:
                 raise BadInputError(exc.kind, f"{folder}: {exc.message}") from exc
-        return head, read_cells(folder, head.geometry)
+        return head, _totals(read_cells(folder, head.layer))
     api, name = api_of(source, tokens)
     info = api.map_info(name)
-    return FolderHead(geometry=info.geometry, sensor_model=info.sensor_model), _fetched(api, name)
+    return FolderHead(geometry=info.geometry, sensor_model=info.sensor_model), _fetched(api, info)
 
 
 def _check_folder(folder: Path) -> None:
@@ -144,10 +145,18 @@ def _check_folder(folder: Path) -> None:
     )
 
 
-def _fetched(api: MapApi, name: str) -> Iterator[DecodedCell]:
+def _fetched(api: MapApi, info: MapInfo) -> Iterator[DecodedCell]:
     with api:
-        for _, cell in fetch_map(api, name):
-            yield cell
+        yield from _totals(cell for _, cell in fetch_map(api, info))
+
+
+def _totals(cells: Iterable[DecodedHistory]) -> Iterator[DecodedCell]:
+    """Sums over all epochs: prior data are of no time, and a new map begins without the history of the old one."""
+    for cell in cells:
+        geometry = cell.layer.geometry
+        evidence = cell.history.total(geometry)
+        digest = cell.digest if not cell.layer.has_epochs else cell_digest(cell.key, evidence, geometry)
+        yield DecodedCell(cell.key, geometry, evidence, digest)
 
 
 def _groups(cells: Iterable[DecodedCell]) -> Iterator[list[DecodedCell]]:

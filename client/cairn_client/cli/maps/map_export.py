@@ -20,7 +20,8 @@ from pydantic import ValidationError
 from cairn_client.cli.arguments import Subparsers, add_map_parser, api_of, say, shown_bytes
 from cairn_client.http.api import MapApi
 from cairn_client.http.http_link import cells_with_evidence, download_cell
-from cairn_map.codec.cell_code import DecodedCell
+from cairn_map.codec.history_code import DecodedHistory
+from cairn_map.epochs.present import shown_evidence
 from cairn_map.errors import BadInputError, NotFoundError, first_error
 from cairn_map.evidence.grid import cell_from_text, cell_key, cell_of_key
 from cairn_map.evidence.voxels import Voxels, joined_voxels, voxels_of_evidence
@@ -98,14 +99,15 @@ def _get(args: argparse.Namespace) -> int:
     with api:
         info = api.map_info(name)
         cell = cell_from_text(args.cell)
-        body, decoded = download_cell(api, name, cell_key(cell))
+        body, decoded = download_cell(api, name, cell_key(cell), info.layer)
+    evidence = shown_evidence(decoded.history, info.layer, info.sensor_model)
     if suffix == ".cell":
         data = body
     else:
         key, model = cell_key(cell), info.sensor_model
-        data, _ = cell_file(suffix[1:], key, decoded.evidence, info.geometry, model)
+        data, _ = cell_file(suffix[1:], key, evidence, info.geometry, model)
     output.write_bytes(data)
-    say(f"cell {cell}: {len(decoded.evidence)} known voxels, {shown_bytes(len(data))} in {output}")
+    say(f"cell {cell}: {len(evidence)} known voxels, {shown_bytes(len(data))} in {output}")
     return 0
 
 
@@ -124,7 +126,8 @@ def _export(args: argparse.Namespace) -> int:
     with api:
         info = api.map_info(name)
         if args.cells:
-            write_head(args.cells, FolderHead(geometry=info.geometry, sensor_model=info.sensor_model))
+            head = FolderHead(geometry=info.geometry, sensor_model=info.sensor_model, epoch_s=info.epoch_s)
+            write_head(args.cells, head)
         voxels, count = _downloaded(api, info, args)
     if args.cells:
         say(f"{count} cells in {args.cells}/")
@@ -161,12 +164,12 @@ def _downloaded(api: MapApi, info: MapInfo, args: argparse.Namespace) -> tuple[_
         BadInputError: kind `too_large`: the voxels do not fit into the memory. A few bytes may stand for millions.
     """
     kept, count, size_bytes = _Kept([], []), 0, 0
-    for body, cell in fetch_map(api, info.name):
+    for body, cell in fetch_map(api, info):
         count += 1
         if args.cells:
             write_cell(args.cells, cell_of_key(cell.key), body)
         if args.npz:
-            size_bytes += VOXEL_BYTES * len(cell.evidence)
+            size_bytes += VOXEL_BYTES * sum(map(len, cell.history.rows.values()))
             _check_memory(size_bytes)
             kept.known.append(_voxels(cell, info, occupied_only=False))
         if args.ply or args.picture:
@@ -186,11 +189,11 @@ def _check_memory(size_bytes: int) -> None:
         )
 
 
-def fetch_map(api: MapApi, name: str) -> Iterator[tuple[bytes, DecodedCell]]:
+def fetch_map(api: MapApi, info: MapInfo) -> Iterator[tuple[bytes, DecodedHistory]]:
     """All cells that hold evidence, each with its bytes, in order of their numbers."""
-    keys = cells_with_evidence(api, name)
+    keys = cells_with_evidence(api, info.name)
     for key in with_progress(keys, "cells", total=len(keys)):
-        yield download_cell(api, name, key)
+        yield download_cell(api, info.name, key, info.layer)
 
 
 def _check_outputs(*paths: Path | None) -> None:
@@ -204,8 +207,9 @@ def _check_outputs(*paths: Path | None) -> None:
             raise BadInputError("bad_output", f"cannot write {path}: is {path.absolute().parent} a folder to write in?")
 
 
-def _voxels(cell: DecodedCell, info: MapInfo, *, occupied_only: bool) -> Voxels:
-    return voxels_of_evidence(cell.key, cell.evidence, cell.geometry, info.sensor_model, occupied_only=occupied_only)
+def _voxels(cell: DecodedHistory, info: MapInfo, *, occupied_only: bool) -> Voxels:
+    evidence = shown_evidence(cell.history, info.layer, info.sensor_model)
+    return voxels_of_evidence(cell.key, evidence, info.geometry, info.sensor_model, occupied_only=occupied_only)
 
 
 def _write(path: Path, data: bytes) -> None:

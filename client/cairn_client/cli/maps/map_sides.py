@@ -16,12 +16,12 @@ from cairn_client.cli.arguments import api_of
 from cairn_client.folders.state_folder import is_state_folder, opened_replica
 from cairn_client.http.http_link import index_of
 from cairn_client.http.origin_tokens import OriginTokens
-from cairn_map.codec.cell_code import encode_cell
+from cairn_map.codec.layer_code import encode_layer_cell
 from cairn_map.commits.version_vector import EMPTY, VersionVector
+from cairn_map.epochs.cell_history import CellHistory, history_fingerprint
+from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import BadInputError
-from cairn_map.evidence.evidence import Evidence
-from cairn_map.evidence.fingerprint import fingerprint
-from cairn_map.evidence.grid import CellKey, Geometry
+from cairn_map.evidence.grid import CellKey
 from cairn_map.files.cell_folder import MAP_FILE, read_cells, read_head
 
 SIDE_CELL = np.dtype([("key", np.uint64), ("fingerprint", "V16"), ("voxels", np.int64), ("size_bytes", np.int64)])
@@ -33,7 +33,7 @@ class MapSide:
     """One of two maps that are compared."""
 
     name: str
-    geometry: Geometry
+    layer: MapLayer
     cells: npt.NDArray[np.void]
     """(N,) `SIDE_CELL`, the cells that hold evidence, by rising number: a server may list a million of them."""
     commits: VersionVector | None
@@ -95,10 +95,10 @@ def difference(a: MapSide, b: MapSide) -> Difference:
     Raises:
         BadInputError: kind `other_geometry`: their grids differ, so nothing can be compared.
     """
-    if a.geometry != b.geometry:
+    if a.layer != b.layer:
         raise BadInputError(
             "other_geometry",
-            f"{a.name} has {a.geometry}, {b.name} has {b.geometry}: they cannot be compared",
+            f"{a.name} has {a.layer}, {b.name} has {b.layer}: they cannot be compared",
         )
     of_a, of_b = a.cells["key"], b.cells["key"]
     common, rows_a, rows_b = np.intersect1d(of_a, of_b, assume_unique=True, return_indices=True)
@@ -117,32 +117,38 @@ def difference(a: MapSide, b: MapSide) -> Difference:
 def _of_server(url: str, tokens: OriginTokens) -> MapSide:
     api, name = api_of(url, tokens)
     with api:
-        geometry, index = api.map_info(name).geometry, index_of(api, name)
+        layer, index = api.map_info(name).layer, index_of(api, name)
     listed = index.cells.table[index.cells.table["voxels"] > 0]
     cells = np.zeros(len(listed), SIDE_CELL)
     for name in SIDE_CELL.names or ():
         cells[name] = listed[name]
-    return MapSide(url, geometry, cells, index.header.coverage)
+    return MapSide(url, layer, cells, index.header.coverage)
 
 
 def _of_state(folder: Path) -> MapSide:
     with opened_replica(folder) as replica:
-        geometry, packed = replica.geometry, replica.view.packed()
+        layer, cells = replica.layer, [(key, replica.view.history(key)) for key in replica.view]
         folded = replica.header.coverage if replica.header else EMPTY
         commits = folded.with_commits(replica.commits)
-    return MapSide(str(folder), geometry, _side_cells(packed.items(), geometry), commits)
+    return MapSide(str(folder), layer, _side_cells(cells, layer), commits)
 
 
 def _of_cells(folder: Path) -> MapSide:
-    geometry = read_head(folder).geometry
-    cells = ((cell.key, cell.evidence) for cell in read_cells(folder, geometry) if len(cell.evidence))
-    return MapSide(str(folder), geometry, _side_cells(cells, geometry), None)
+    layer = read_head(folder).layer
+    cells = ((cell.key, cell.history) for cell in read_cells(folder, layer))
+    return MapSide(str(folder), layer, _side_cells(cells, layer), None)
 
 
-def _side_cells(cells: Iterable[tuple[CellKey, Evidence]], geometry: Geometry) -> npt.NDArray[np.void]:
+def _side_cells(cells: Iterable[tuple[CellKey, CellHistory]], layer: MapLayer) -> npt.NDArray[np.void]:
     """(N,) `SIDE_CELL` of cells that are here, in order of their numbers."""
     rows = [
-        (key, fingerprint(evidence, key).to_bytes(), len(evidence), len(encode_cell(key, evidence, geometry).data))
-        for key, evidence in cells
+        (
+            key,
+            history_fingerprint(history, key, layer_word=layer.word).to_bytes(),
+            sum(map(len, history.rows.values())),
+            len(encode_layer_cell(key, history, layer).data),
+        )
+        for key, history in cells
+        if len(history)
     ]
     return np.sort(np.array(rows, SIDE_CELL), order="key")

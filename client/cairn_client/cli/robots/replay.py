@@ -22,9 +22,10 @@ from cairn_fusion.recording.view_agreement import pose_doubt
 from cairn_fusion.recording.way_doubts import way_doubts
 from cairn_map.codec.cell_code import Profile
 from cairn_map.commits.commit import Commit
+from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import BadInputError, DamagedDataError, NotFoundError, UnreachableError
 from cairn_map.evidence.channels import COLOUR, INTENSITY, TEMPERATURE, Channel
-from cairn_map.evidence.grid import Geometry, geometry_for
+from cairn_map.evidence.grid import geometry_for
 from cairn_map.progress import with_progress
 from cairn_map.wire.messages import CreateMap
 
@@ -41,7 +42,7 @@ def _replay(args: argparse.Namespace) -> int:
     source = asked_source(args.recording, args, scans_per_measurement=size)
     _say_range(source)
     _say_doubts(source, args)
-    geometry = ensure_map(args, source)
+    layer = ensure_map(args, source)
     name = args.name or default_name(source.name)
     state = args.state or Path(f"cairn-{name}")
     part = f"{args.recording.resolve()} {args.share[0]}/{args.share[1]}"
@@ -64,7 +65,7 @@ def _replay(args: argparse.Namespace) -> int:
         name=name,
         token=args.token.of(args.map),
         mode=args.mode,
-        geometry=geometry,
+        geometry=layer,
         integrator=integrator_of(args),
         scope=scope_of(args, args.mode),
         link=args.link,
@@ -175,19 +176,21 @@ def _is_folded(robot: Robot) -> bool:
         return False
 
 
-def ensure_map(args: argparse.Namespace, source: ScanSource) -> Geometry | None:
-    """The map's geometry, of a new map if there is none; None without a link: the state folder may know it."""
+def ensure_map(args: argparse.Namespace, source: ScanSource) -> MapLayer | None:
+    """The map's grid and epochs, of a new map if there is none; None without a link: the state folder may know it."""
     api, name = api_of(args.map, args.token)
     with api:
         return _ensured(api, name, args, source)
 
 
-def _ensured(api: MapApi, name: str, args: argparse.Namespace, source: ScanSource) -> Geometry | None:
+def _ensured(api: MapApi, name: str, args: argparse.Namespace, source: ScanSource) -> MapLayer | None:
     wished = geometry_for(voxel_edge_m=args.voxel) if args.voxel is not None else None
     try:
-        geometry = api.map_info(name).geometry
+        layer = api.map_info(name).layer
     except UnreachableError:
-        return geometry_for(voxel_edge_m=args.voxel, channels=_channels(source)) if args.voxel else None
+        if not args.voxel:
+            return None
+        return MapLayer(geometry=geometry_for(voxel_edge_m=args.voxel, channels=_channels(source)))
     except NotFoundError as exc:
         if exc.kind != "no_map":
             raise
@@ -196,14 +199,15 @@ def _ensured(api: MapApi, name: str, args: argparse.Namespace, source: ScanSourc
                 "no_map", f"there is no map {name} yet; make one with `cairn map create`, or give --voxel METRES"
             ) from exc
         made = geometry_for(voxel_edge_m=args.voxel, channels=_channels(source))
-        return api.create_map(name, CreateMap(geometry=made)).geometry
+        return api.create_map(name, CreateMap(geometry=made)).layer
+    geometry = layer.geometry
     if wished is not None and wished.voxel_edge_um != geometry.voxel_edge_um:
         raise BadInputError(
             "other_geometry",
             f"map {name} has voxels of {shown_length(geometry.voxel_edge_m)}, not {shown_length(wished.voxel_edge_m)}; "
             "leave --voxel out, or choose another map",
         )
-    return geometry
+    return layer
 
 
 def _channels(source: ScanSource) -> tuple[Channel, ...]:
