@@ -9,7 +9,7 @@ import pytest
 from tests.fixtures.client.made import cells_of
 from tests.memory_store import map as memory_map
 from tests.sync_sim.events import Events
-from tests.sync_sim.joined import JoinedHistory
+from tests.sync_sim.joined import JoinedHistory, any_epoch, layer_of
 from tests.sync_sim.network import Network, Weather
 from tests.sync_sim.robot import SimRobot
 from tests.sync_sim.server import FoldOnRequest, SimServer, with_more
@@ -18,7 +18,9 @@ from cairn_client.replica.server_cells import ServerCells
 from cairn_client.sync.exchange import MISFIT, Exchange
 from cairn_map.commits import ids
 from cairn_map.commits.ids import OPERATOR, CommitId
-from cairn_map.evidence.fingerprint import ZERO, fingerprint
+from cairn_map.epochs.cell_history import history_fingerprint
+from cairn_map.epochs.epoch import Epoch
+from cairn_map.evidence.fingerprint import ZERO
 from cairn_map.evidence.grid import CellKey
 from cairn_server import service as service_module
 from cairn_server.folding import commit_work
@@ -64,10 +66,11 @@ class History:
         self.clock_s = 1.7e9
         """What clocks are ahead of virtual time."""
         self._events = Events()
-        self._server = SimServer()
+        self._layer = layer_of(seed)
+        self._server = SimServer(self._layer)
         self._network = Network(self._events, self._server, self._random)
         count = self._random.randint(2, len(MODES))
-        self._robots = [SimRobot(f"r{n}", MODES[n], self._network.ask) for n in range(count)]
+        self._robots = [SimRobot(f"r{n}", MODES[n], self._network.ask, layer=self._layer) for n in range(count)]
         self._mappers = [robot for robot in self._robots if robot.mode != "viewer"]
         self.may_misfit = False
         """Fingerprints may be the first to notice: bytes were damaged on their way, or a disk was rolled back, and its
@@ -100,18 +103,19 @@ class History:
         self._log(f"{self._events.now_s:6.1f} s  {name}")
         getattr(self, f"_{name}")()
         self._check_bases()
+        self._more.choice(self._robots).check_view()
 
     # What can happen
 
     def _commit(self) -> None:
-        self._mapper().commit(self._random.randrange(60), note=self._note())
+        self._mapper().commit(self._random.randrange(60), note=self._note(), epoch=self._epoch())
 
     def _amend(self) -> None:
         robot = self._mapper()
         own = [commit for commit in robot.notes() if commit.author.robot == robot.name]
         if own:
             taken_back = with_more(str(self._random.choice(own)), map(str, own), self._more)
-            robot.commit(self._random.randrange(60), note=self._note(), retracts=taken_back)
+            robot.commit(self._random.randrange(60), note=self._note(), retracts=taken_back, epoch=self._epoch())
 
     def _sync(self) -> None:
         robot = self._random.choice(self._robots)
@@ -189,7 +193,8 @@ class History:
         """Each base is the server's cell at its cursor, and what is on the disk has its fingerprint."""
         for robot in self._robots:
             for key, cell in robot.replica.cells.items():
-                assert fingerprint(robot.replica.base_evidence(key), key) == cell.fingerprint
+                history = robot.replica.base_history(key)
+                assert history_fingerprint(history, key, layer_word=self._layer.word) == cell.fingerprint
                 if cell.cursor is not None:
                     state = self._server.states[cell.cursor]
                     assert cell.fingerprint.hex() == state.get(key, ZERO.hex())
@@ -241,6 +246,9 @@ class History:
 
     def _mapper(self) -> SimRobot:
         return self._random.choice(self._mappers)
+
+    def _epoch(self) -> Epoch | None:
+        return any_epoch(self._layer, self._more, self.time_s())
 
     def _note(self) -> str:
         self._notes += 1

@@ -7,7 +7,7 @@ map, byte for byte, with nothing lost, whatever way everything went.
 from collections.abc import Callable
 from random import Random
 
-from tests.fixtures.client.made import cells_of
+from tests.fixtures.client.made import PLAIN, WITH_EPOCHS, cells_of
 from tests.sync_sim.events import Events
 from tests.sync_sim.network import Network, Weather
 from tests.sync_sim.relay import Bag, SimEnd, SimRelay
@@ -16,7 +16,10 @@ from tests.sync_sim.server import SimServer, with_more
 
 from cairn_client.sync.requests import Ask
 from cairn_map.commits.ids import OPERATOR, CommitId
-from cairn_map.evidence.fingerprint import ZERO, fingerprint
+from cairn_map.epochs.cell_history import history_fingerprint
+from cairn_map.epochs.epoch import Epoch, epoch_of
+from cairn_map.epochs.layer import MapLayer
+from cairn_map.evidence.fingerprint import ZERO
 from cairn_server.sync.handing_over import server_key
 
 MODES = ("high-end", "low-end", "high-end", "viewer")
@@ -48,6 +51,19 @@ SELDOM = (
 )
 
 
+def layer_of(seed: int) -> MapLayer:
+    """Of every other four seeds a map with epochs: of both kinds of history."""
+    return WITH_EPOCHS if seed % 8 >= 4 else PLAIN
+
+
+def any_epoch(layer: MapLayer, random: Random, now_s: float) -> Epoch | None:
+    """Epoch of a commit: the present one for its author's clock, which may be one off; now and then one long past."""
+    if layer.epoch_s is None or random.random() < 0.1:
+        return None
+    late = random.randrange(8) if random.random() < 0.3 else 0
+    return Epoch(epoch_of(now_s, layer.epoch_s) + random.choice((-1, 0, 0, 1)) - late)
+
+
 class JoinedHistory:
     """What happens in one seed."""
 
@@ -60,12 +76,13 @@ class JoinedHistory:
         self._keys: dict[str, None] = {}
         self._events = Events()
         self._weather_now = Weather()
-        self._servers = [SimServer() for _ in range(self._random.randint(2, 3))]
+        self._layer = layer_of(seed)
+        self._servers = [SimServer(self._layer) for _ in range(self._random.randint(2, 3))]
         self._share_states()
         self._trust()
         self._networks = [Network(self._events, server, self._random) for server in self._servers]
         count = self._random.randint(2, len(MODES))
-        self._robots = [SimRobot(f"r{n}", MODES[n], self._ask) for n in range(count)]
+        self._robots = [SimRobot(f"r{n}", MODES[n], self._ask, layer=self._layer) for n in range(count)]
         self._places = {robot.name: self._random.randrange(len(self._servers)) for robot in self._robots}
         self._bags = {robot.name: Bag() for robot in self._robots}
         ends = [SimEnd(server) for server in self._servers]
@@ -107,18 +124,20 @@ class JoinedHistory:
         self._log(f"{self._events.now_s:6.1f} s  {name}")
         getattr(self, f"_{name}")()
         self._check_bases()
+        self._more.choice(self._robots).check_view()
 
     # What can happen
 
     def _commit(self) -> None:
-        self._random.choice(self._mappers).commit(self._random.randrange(60), note=self._note())
+        robot, seed = self._random.choice(self._mappers), self._random.randrange(60)
+        robot.commit(seed, note=self._note(), epoch=self._epoch())
 
     def _amend(self) -> None:
         robot = self._random.choice(self._mappers)
         own = [commit for commit in robot.notes() if commit.author.robot == robot.name]
         if own:
             taken_back = with_more(str(self._random.choice(own)), map(str, own), self._more)
-            robot.commit(self._random.randrange(60), note=self._note(), retracts=taken_back)
+            robot.commit(self._random.randrange(60), note=self._note(), retracts=taken_back, epoch=self._epoch())
 
     def _sync(self) -> None:
         self._random.choice(self._robots).start_round()
@@ -229,7 +248,8 @@ class JoinedHistory:
         """Each base is some server's cell at its cursor, and what is on the disk has its fingerprint."""
         for robot in self._robots:
             for key, cell in robot.replica.cells.items():
-                assert fingerprint(robot.replica.base_evidence(key), key) == cell.fingerprint
+                history = robot.replica.base_history(key)
+                assert history_fingerprint(history, key, layer_word=self._layer.word) == cell.fingerprint
                 if cell.cursor is not None:
                     state = self._servers[0].states[cell.cursor]
                     assert cell.fingerprint.hex() == state.get(key, ZERO.hex())
@@ -331,6 +351,9 @@ class JoinedHistory:
 
     def _finish(self, robot: SimRobot) -> None:
         self._events.run_while(lambda: robot.is_busy)
+
+    def _epoch(self) -> Epoch | None:
+        return any_epoch(self._layer, self._more, self.time_s())
 
     def _note(self) -> str:
         self._notes += 1

@@ -10,16 +10,17 @@ from pathlib import Path
 from typing import Any
 
 import apsw
-from tests.fixtures.client.made import GEOMETRY, MAP, B, random_diff
+from tests.fixtures.client.made import PLAIN, B, random_diff, replica_on
 
 from cairn_client.replica.outbox import CommitFacts
-from cairn_client.replica.replica import Replica
 from cairn_client.replica.replica_store import ReplicaStore
 from cairn_client.sync.requests import Ask, Conversation
 from cairn_client.sync.sync import fetch_cells, fetch_missing, push_commits
 from cairn_client.sync.uploads import PARTS, Parts
 from cairn_map.commits.commit import split_commit
-from cairn_map.commits.ids import CommitId, RobotName, commit_id_from_text
+from cairn_map.commits.ids import CommitId, commit_id_from_text
+from cairn_map.epochs.epoch import Epoch
+from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import CairnError
 from cairn_map.evidence.grid import cell_of_key
 
@@ -53,8 +54,11 @@ class MemoryDisk(ReplicaStore):
 class SimRobot:
     """One robot; `ask` sends a round's request on its way, and `answered` or `failed` is called some time later."""
 
-    def __init__(self, name: str, mode: str, ask: Callable[["SimRobot", int, Ask[Any]], None]) -> None:
+    def __init__(
+        self, name: str, mode: str, ask: Callable[["SimRobot", int, Ask[Any]], None], *, layer: MapLayer = PLAIN
+    ) -> None:
         self.name = name
+        self._layer = layer
         self.mode = mode
         self._ask = ask
         self._rounds_begun = 0
@@ -74,10 +78,18 @@ class SimRobot:
         """Whether this round is under way: to any other, an answer comes too late."""
         return number in self._conversations
 
-    def commit(self, seed: int, *, note: str, retracts: tuple[str, ...] = ()) -> None:
-        """Map something."""
-        facts = CommitFacts(retracts=tuple(map(commit_id_from_text, retracts)), note=note)
+    def commit(self, seed: int, *, note: str, retracts: tuple[str, ...] = (), epoch: Epoch | None = None) -> None:
+        """Map something, in an epoch."""
+        facts = CommitFacts(retracts=tuple(map(commit_id_from_text, retracts)), note=note, epoch=epoch)
         self.replica.commit(random_diff(seed), facts)
+
+    def check_view(self) -> None:
+        """What the view shows is what a robot that starts now on a copy of this disk would show."""
+        copy = replica_on(MemoryDisk(self.disk.image()), self.name, layer=self._layer)
+        try:
+            assert copy.view == self.replica.view, f"{self.name} shows another map than its disk holds"
+        finally:
+            copy.close()
 
     def notes(self) -> dict[CommitId, str]:
         """Commits that are kept here, and their notes."""
@@ -152,4 +164,4 @@ class SimRobot:
 
     def _open(self, disk: MemoryDisk) -> None:
         self.disk = disk
-        self.replica = Replica(disk, robot=RobotName(self.name), map_name=MAP, geometry=GEOMETRY, keep_acked_s=0.0)
+        self.replica = replica_on(disk, self.name, layer=self._layer)

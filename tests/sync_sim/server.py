@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 from random import Random
 from typing import Any
 
-from tests.fixtures.client.made import GEOMETRY, MAP
+from tests.fixtures.client.made import GEOMETRY, MAP, PLAIN
 from tests.memory_store.map import MemoryMap
 from tests.memory_store.snapshot import MemorySnapshot
 from tests.memory_store.store import MemoryStore
@@ -16,8 +16,9 @@ from cairn_map.commits.commit import CommitMeta, split_commit
 from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.ids import OPERATOR, CommitId, author_from_text
 from cairn_map.commits.version_vector import EMPTY, VersionVector
+from cairn_map.epochs.history_map import HistoryMap
+from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import BadInputError, ConflictError, NotFoundError
-from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.grid import CellKey, cell_key
 from cairn_map.wire.messages import CellIndex, CreateMap, MissingRequest, Retract
 from cairn_map.wire.relay_peer import SignedCommit
@@ -63,12 +64,13 @@ class StableBackup:
 class SimServer:
     """A server that can be restored and replaced."""
 
-    def __init__(self) -> None:
+    def __init__(self, layer: MapLayer = PLAIN) -> None:
+        self.layer = layer
         self.settings = Settings()
         self._stable = StableBackup()
         self._backup: MemoryMap | None = None
-        self._evidence: dict[CommitId, tuple[str, dict[CellKey, bytes]]] = {}
-        """Note and diff of every commit that was ever here: a server may forget them, a test may not."""
+        self._evidence: dict[CommitId, tuple[CommitMeta, dict[CellKey, bytes]]] = {}
+        """Meta and diff of every commit that was ever here: a server may forget them, a test may not."""
         self.states: dict[Cursor, Fingerprints] = {}
         """What each state that ever was held, by its cursor."""
         self.replace()
@@ -77,7 +79,7 @@ class SimServer:
         """Another server, with nothing on it, under the same name."""
         self._backup, self._stable.vector = None, EMPTY
         self._start(MemoryStore())
-        self.service.maps.create(MAP, CreateMap(geometry=GEOMETRY))
+        self.service.maps.create(MAP, CreateMap(geometry=self.layer.geometry, epoch_s=self.layer.epoch_s))
         self._note_state()
 
     def restart(self) -> None:
@@ -119,7 +121,7 @@ class SimServer:
         """A relay brings a commit."""
         self.service.sync.pushes.keep(self.row, by, str(commit.id), commit.data, signatures=commit.signatures)
         meta, cells = split_commit(commit.data)
-        self._evidence[commit.id] = meta.note, cells
+        self._evidence[commit.id] = meta, cells
 
     @property
     def backed_up(self) -> VersionVector:
@@ -137,7 +139,7 @@ class SimServer:
             case Push(commit, seal, signatures):
                 beside = {"seal": seal, "signatures": signatures}
                 service.sync.pushes.keep(row, Caller(Role.ROBOT, robot), str(commit.id), commit.data, **beside)
-                self._evidence[commit.id] = commit.meta.note, commit.cells
+                self._evidence[commit.id] = commit.meta, commit.cells
                 return None
             case GetUpload(commit_id, digest):
                 return service.sync.uploads.state(row, Caller(Role.ROBOT, robot), str(commit_id), digest)
@@ -149,7 +151,7 @@ class SimServer:
                 kept = service.store.commit(row, commit_id)
                 if kept is not None and not kept.gone:  # perhaps under an id that was another server's
                     meta, cells = split_commit(found_commit(service.store, row, str(commit_id)).data)
-                    self._evidence[commit_id] = meta.note, cells
+                    self._evidence[commit_id] = meta, cells
                 return upload
             case GetCommit(commit_id):
                 found = found_commit(service.store, row, str(commit_id))
@@ -206,7 +208,7 @@ class SimServer:
         """Every commit of robots that is here, and its note."""
         with self._store._maps.reading(self.row) as state:
             here = [commit for commit in state.commits if commit.author.robot != OPERATOR]
-        return {commit: self._evidence[commit][0] for commit in here}
+        return {commit: self._evidence[commit][0].note for commit in here}
 
     def shas(self) -> dict[CommitId, str]:
         """Every commit that is here, and its SHA-256."""
@@ -223,13 +225,13 @@ class SimServer:
         """Whether it is taken out, or will be when it comes."""
         return self._store.is_retracted(self.row, commit)
 
-    def sum_of_commits(self) -> EvidenceMap:
-        """The map as its definition says: all commits that are not retracted."""
-        total = EvidenceMap(GEOMETRY)
+    def sum_of_commits(self) -> HistoryMap:
+        """The map as its definition says: all commits that are not retracted, each in the row of its epoch."""
+        total = HistoryMap(self.layer)
         for commit in self.commits():
             if not self.is_retracted(commit):
-                cells = self._evidence[commit][1]
-                total.merge({key: decode_cell(body).evidence for key, body in cells.items()})
+                meta, cells = self._evidence[commit]
+                total.merge({key: decode_cell(body).evidence for key, body in cells.items()}, epoch=meta.row)
         return total
 
     def cells(self) -> dict[CellKey, tuple[bytes, str]]:
@@ -256,7 +258,7 @@ class SimServer:
         self._store = store
         self.service = Service(store, self.settings)
         self.service.sync.replies._stable = self._stable  # type: ignore[assignment]
-        self._cache = CellCache(GEOMETRY)
+        self._cache = CellCache(self.layer.geometry)
 
     def _note_state(self) -> None:
         with self._store.snapshot(self.row) as snapshot:

@@ -364,9 +364,17 @@ class MapApi:
         self._ask("PUT", f"/maps/{name}/main/cells/{cell}", content=data, headers=headers)
 
     def missing(
-        self, name: str, branch: str, request: MissingRequest, *, replies: Replies | None = None
+        self,
+        name: str,
+        branch: str,
+        request: MissingRequest,
+        *,
+        replies: Replies | None = None,
+        has_epochs: bool = True,
     ) -> Generator[Frame, None, None]:
         """Frames as they arrive; with `replies`, nothing that came with an earlier reply comes again.
+
+        Without epochs, nothing has to be said of the version of cells that is read.
 
         Raises:
             UnreachableError: the link broke; the frames before it were whole and may be kept.
@@ -374,7 +382,8 @@ class MapApi:
         """
         reply = (replies or Replies()).reply_to(request)
         body = reply.request.model_dump_json(exclude_defaults=True).encode()
-        with self._open("POST", f"/maps/{name}/branches/{branch}/missing", content=body) as (response, deadline):
+        path, headers = f"/maps/{name}/branches/{branch}/missing", {} if has_epochs else {"Cairn-Format": ""}
+        with self._open("POST", path, content=body, headers=headers) as (response, deadline):
             known = response.status_code == NO_CONTENT
             parts = parts_of(response, self.traffic, at_most_bytes=REPLY_BYTES_MAX, deadline=deadline)
             yield from reply.again() if known else reply.frames(parts)
@@ -431,6 +440,7 @@ class MapApi:
 
         sent = {"Cairn-Protocol": PROTOCOL_VERSION, "Cairn-Format": FORMAT_VERSION, "Accept-Encoding": CODING}
         sent |= headers or {}
+        sent = {field: text for field, text in sent.items() if text}
         if self.token:
             sent["Authorization"] = f"Bearer {self.token}"
         if content:

@@ -36,8 +36,9 @@ T = TypeVar("T")
 class Link:
     """HTTP link of one robot to one map: it holds conversations."""
 
-    def __init__(self, api: MapApi, map_name: str, *, branch: str) -> None:
+    def __init__(self, api: MapApi, map_name: str, *, branch: str, has_epochs: bool = True) -> None:
         self._api = api
+        self._has_epochs = has_epochs
         self._map_name = map_name
         self._branch = branch
         self._frames: Generator[Frame, None, None] | None = None
@@ -66,7 +67,9 @@ class Link:
                 return api.commit(name, commit_id)
             case GetMissing(request):
                 self._stop_reading()
-                self._frames = api.missing(name, self._branch, request, replies=self._replies)
+                self._frames = api.missing(
+                    name, self._branch, request, replies=self._replies, has_epochs=self._has_epochs
+                )
                 return next(self._frames, None)
             case NextFrame():
                 return next(self._frames, None) if self._frames else None

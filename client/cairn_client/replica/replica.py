@@ -391,6 +391,7 @@ class Replica:
                 self.store.clear_acked()
                 self.state.header = None
                 self.state.default_cursor = None
+                self.state.default_coverage = None
             self.header = None
             shown = {*self._base.cells, *self.outbox.cells}
             self._base.forget()
@@ -475,5 +476,5 @@ class Replica:
 
     def _is_covered(self, kept: KeptCommit, wanted: Callable[[Cell], bool] | None) -> bool:
         needed = [key for key in kept.cells if wanted is None or wanted(cell_of_key(key))]
-        cells = [self._base.cells.get(key) for key in needed]
-        return all(cell is not None and cell.cursor is not None and kept.id in cell.coverage for cell in cells)
+        base = self._base
+        return all(base.cursor(key) is not None and kept.id in base.coverage(key) for key in needed)

@@ -27,6 +27,7 @@ from cairn_map.commits.commit import Commit
 from cairn_map.commits.cursor import Cursor, cursor_from_text
 from cairn_map.commits.ids import CommitId, Incarnation, RobotName, commit_id_from_text
 from cairn_map.commits.signature import SIGNATURES_MAX, Signature, SigningKey, signatures_to_text
+from cairn_map.commits.version_vector import VersionVector, vector_text, version_vector_from_json
 from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import BadInputError, DamagedDataError
 from cairn_map.evidence.grid import Geometry
@@ -127,6 +128,10 @@ class ReplicaState:
     """Newest state that the server reported."""
     default_cursor = Field[Cursor]("default_cursor", cursor_from_text)
     """Cursor of every cell that is not held."""
+    default_coverage = Field[VersionVector](
+        "default_coverage", lambda text: version_vector_from_json(json.loads(text)), vector_text
+    )
+    """Commits in the server's map at that cursor."""
     token = Field("token", str)
     """Token that a server gave to the robot."""
     token_origin = Field("token_origin", str)

@@ -65,6 +65,7 @@ class ServerCells:
         """Evidence that the robot shows."""
         self.default_cursor = state.default_cursor
         """Cursor of every cell that is not held."""
+        self._default_coverage = state.default_coverage or EMPTY
         self.cells: dict[CellKey, BaseCell] = self._store.cells()
         """Cells that are held, without their bytes."""
         for key, cell in list(self.cells.items()):
@@ -87,8 +88,13 @@ class ServerCells:
         return cell.cursor if cell else self.default_cursor
 
     def coverage(self, key: CellKey) -> VersionVector:
-        """Ids that are in a cell's base."""
-        return self.cells[key].coverage if key in self.cells else EMPTY
+        """Ids that are in a cell's base; of a cell that is not held, since the server has none, those of its map."""
+        return self.cells[key].coverage if key in self.cells else self._coverage_of_none(key)
+
+    def _coverage_of_none(self, key: CellKey) -> VersionVector:
+        # Of an own commit that was never acknowledged, the server may have other bytes under its id (rule 13).
+        unproven = [kept.id for kept in self._outbox.touching(key) if not kept.acked]
+        return self._default_coverage.minus(EMPTY.with_commits(unproven))
 
     def history(self, key: CellKey) -> CellHistory:
         """The server's evidence of a cell; none if its bytes are damaged, which its fingerprint shows."""
@@ -137,15 +143,27 @@ class ServerCells:
             self.cells[key] = UNPROVEN
             self.refresh(key)
 
-    def set_default_cursor(self, cursor: Cursor) -> None:
-        """Set the cursor of every cell that is not held."""
-        self._state.default_cursor = cursor
-        self.default_cursor = cursor
+    def set_default_cursor(self, cursor: Cursor, coverage: VersionVector) -> None:
+        """Set the cursor of every cell that is not held, of which the server has no evidence then, and its coverage.
+
+        What was taken out of all the server's cells is covered, too: else it would be shown again, once the commit that
+        took it out need not be kept any more.
+        """
+        unheld = self._outbox.cells - self.cells.keys()
+        shown = {key: changes(self._outbox, key, self.coverage(key)) for key in unheld}
+        with self._store.transaction():
+            self._state.default_cursor = cursor
+            if coverage != self._default_coverage:  # it may have thousands of authors
+                self._state.default_coverage = coverage
+        self.default_cursor, self._default_coverage = cursor, coverage
+        for key in unheld:
+            if changes(self._outbox, key, self.coverage(key)) != shown[key]:
+                self.refresh(key)
 
     def forget(self) -> None:
         """Forget all cells, which the store does not hold any more, without a change of the view."""
         self.cells.clear()
-        self.default_cursor = None
+        self.default_cursor, self._default_coverage = None, EMPTY
 
     def refresh(self, key: CellKey) -> None:
         """Make the view of a cell its base, changed by the commits that are kept (rule 7)."""

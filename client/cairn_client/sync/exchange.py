@@ -211,7 +211,7 @@ class Exchange:
         # All of them move at once; a cell that is not held moves with the default cursor, unless a box was asked for.
         base.move(rest, to=done.to_cursor, coverage=self._coverage)
         if self._box is None:
-            base.set_default_cursor(done.to_cursor)
+            base.set_default_cursor(done.to_cursor, self._coverage)
         self._replica.forget_stable_commits()
         self.is_done = True
 

@@ -179,3 +179,20 @@ def test_a_folder_whose_commit_has_many_cells_is_opened_by_reading_the_commit_on
     assert all(last.view.evidence(key) == added(X, Y) for key in cells)
     assert len(reads) > 60
     last.close()
+
+
+def test_what_was_taken_out_of_a_cell_that_is_empty_then_stays_out_when_the_retract_is_forgotten(
+    mole: Replica, tmp_path: Path
+) -> None:
+    wrong = committed(mole, X)
+    mole.acknowledge(wrong.id)
+    meta = CommitMeta(id="operator.0123456789abcdef.0", geometry=GEOMETRY.digest().hex(), retracts=(str(wrong.id),))
+    retract = make_commit(meta, {}, GEOMETRY)
+    mole.keep_sealed(retract, "the seal")
+    # Of a cell from which all was taken out, who holds nothing gets no frame.
+    both = covering(wrong.id, retract.id)
+    assert exchanged(mole, header(C1, both, stable=both), done(C1)).is_done
+    assert mole.forget_stable_commits() == 1
+    assert mole.commits == []
+    assert len(mole.view.evidence(A)) == 0
+    assert is_the_same_after_a_restart(mole, tmp_path)

@@ -352,7 +352,7 @@ class OtherServer:
     def push(self, name: str, commit: object, **beside: str | None) -> None:
         self.pushed.append(commit.id)  # type: ignore[attr-defined]
 
-    def missing(self, name: str, branch: str, request: MissingRequest, *, replies: object) -> Iterator[object]:
+    def missing(self, name: str, branch: str, request: MissingRequest, **options: object) -> Iterator[object]:
         if request.cursor or any(cursor for cursor, _ in request.groups):
             raise ConflictError("other_log", "the cursor belongs to another server's log")
         to = Cursor(bytes(16), 0, bytes(16))
