@@ -46,11 +46,11 @@ class Maps:
 
         Raises:
             BadInputError: kind `cell_too_large`: one full cell would take more memory than this server has for it.
-            ConflictError: kind `map_exists`: another geometry or sensor model.
+            ConflictError: kind `map_exists`: another geometry, sensor model or length of epochs; `older_servers`.
         """
         if all(row.name != name for row in self._store.maps()):
             check_geometry(request.geometry, self._shares)
-        row, is_new = self._store.create_map(robot_name(name), request.geometry, request.sensor_model)
+        row, is_new = self._store.create_map(robot_name(name), request.geometry, request.sensor_model, request.epoch_s)
         return self.info(row), is_new
 
     def warn_of_large_cells(self) -> None:
@@ -84,6 +84,8 @@ class Maps:
             branches=totals.branches,
             box_m=box_m,
             server_key=server_key(row).public_key.hex(),
+            epoch_s=row.epoch_s,
+            history_bytes=totals.history_bytes,
         )
 
     def register(self, row: MapRow, request: Register, grounds: Grounds = OWN_WORD) -> Registered:

@@ -137,6 +137,10 @@ def metrics_text(metrics: Iterable[Metric]) -> str:
 def store_metrics(found: StoreFigures, backlogs: list[Backlog], at_work: Collection[str]) -> Iterator[Metric]:
     """Sizes, writes and backlogs of the store; of maps at work also that nothing waits."""
     yield GaugeMetricFamily("cairn_store_size_bytes", "Size of the store at rest.", found.size_bytes)
+    cells = GaugeMetricFamily("cairn_cells_size_bytes", "Size of the cells of all maps, by part.", labels=["part"])
+    cells.add_metric(["present"], found.cells_bytes - found.history_bytes)
+    cells.add_metric(["history"], found.history_bytes)
+    yield cells
     yield GaugeMetricFamily("cairn_wal_size_bytes", "Size of what the store wrote ahead.", found.ahead_bytes)
     if found.free_bytes is not None:
         yield GaugeMetricFamily("cairn_disk_free_bytes", "Free space on the store's disk.", found.free_bytes)

@@ -8,10 +8,11 @@ from pathlib import Path
 
 import pytest
 from prometheus_client import CollectorRegistry, Counter, Histogram
+from tests.fixtures.server.epoch_contract import cell_of, fold_by_hand
 from tests.fixtures.server.live import Live, until
 from tests.fixtures.server.prometheus_text import families_of, value
 from tests.fixtures.server.protocol_document import DOCUMENT, ROOT
-from tests.fixtures.server.pushes import MOLE, pushed
+from tests.fixtures.server.pushes import KEYS, MOLE, pushed
 
 from cairn_server import metrics
 from cairn_server.folding import fold_thread, group_folding
@@ -112,8 +113,12 @@ def test_what_waits_to_be_folded_shows_until_it_is(fresh: Live, monkeypatch: pyt
 
 
 def test_the_store_and_the_process_show_their_sizes(live: Live) -> None:
-    live.new_map()
+    row, before = live.new_map(), text_of(live)
+    fold_by_hand(live.service.store, row, [cell_of(KEYS[0], lm=0, history_bytes=50, present_bytes=7)])
     text = text_of(live)
+    for part, size_bytes in (("present", 7), ("history", 50)):
+        name = "cairn_cells_size_bytes"
+        assert value(text, name, part=part) - value(before, name, part=part) == size_bytes
     for name in ("cairn_store_size_bytes", "cairn_wal_size_bytes", "cairn_disk_free_bytes", "process_open_fds"):
         assert value(text, name) > 0
     assert value(text, "cairn_writer_failures_total", kind="disk_full") == 0

@@ -44,6 +44,7 @@ class MemoryHealth:
         """Sizes and counts."""
         with self._maps.locked() as maps:
             size_bytes = sum(_size_bytes(state) for state in maps.values())
+            cells = [cell for state in maps.values() for cell in state.cells.values() if cell.voxels]
             return StoreFigures(
                 size_bytes=size_bytes,
                 ahead_bytes=0,
@@ -52,6 +53,8 @@ class MemoryHealth:
                 written=self._maps.written,
                 emptied=0,
                 failures={},
+                cells_bytes=sum(cell.size_bytes for cell in cells),
+                history_bytes=sum(cell.history_bytes for cell in cells),
             )
 
     def check_space(self, free_bytes_min: int) -> None:

@@ -10,8 +10,9 @@ from tests.memory_store.admission import admit_commit
 
 from cairn_map.commits.cursor import ENTRY_FOLD, Cursor, first_chain
 from cairn_map.commits.ids import SERVERS_OWN, Author, CommitId
+from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import BadInputError, ConflictError, NotFoundError
-from cairn_map.evidence.grid import CellKey, Geometry
+from cairn_map.evidence.grid import CellKey
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.store.admission import RobotKey
 from cairn_server.store.numbering import AGAIN_KEPT_S, EvidenceGoneError, Numbering, check_number
@@ -79,6 +80,7 @@ class Kept:
             gone=self.is_gone,
             signatures=self.new.signatures,
             due_from=self.due_from,
+            epoch=self.new.epoch,
         )
 
 
@@ -328,10 +330,15 @@ def _sum(tops: Tops, more: Tops | None) -> Tops:
     return tuple(a + b for a, b in zip(tops, more, strict=True)) if more else tops
 
 
-def new_memory_map(number: int, name: str, geometry: Geometry, sensor_model: SensorModel) -> MemoryMap:
+def new_memory_map(number: int, name: str, layer: MapLayer, sensor_model: SensorModel) -> MemoryMap:
     """A map without anything in it."""
     row = MapRow(
-        number=number, name=name, geometry=geometry, sensor_model=sensor_model, seal_key=secrets.token_bytes(32)
+        number=number,
+        name=name,
+        geometry=layer.geometry,
+        sensor_model=sensor_model,
+        seal_key=secrets.token_bytes(32),
+        epoch_s=layer.epoch_s,
     )
     log_id = secrets.token_bytes(16)
-    return MemoryMap(row, Cursor(log_id, 0, first_chain(log_id, geometry.digest())))
+    return MemoryMap(row, Cursor(log_id, 0, first_chain(log_id, layer.geometry.digest())))

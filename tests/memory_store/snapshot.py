@@ -144,6 +144,7 @@ class MemorySnapshot:
         return Totals(
             cells=len(cells),
             size_bytes=sum(cell.size_bytes for cell in cells),
+            history_bytes=sum(cell.history_bytes for cell in cells),
             commits=sum(not kept.is_damaged for kept in self._state.commits.values()),
             branches=len(self._state.branches),
             corner_cells=((min(axes[0]), min(axes[1]), min(axes[2])), (max(axes[0]), max(axes[1]), max(axes[2])))
@@ -164,8 +165,8 @@ class MemorySnapshot:
     def _contribution(self, key: CellKey, seq: int) -> Contribution:
         entry = self._state.entries[seq - 1]
         commit = self._state.ids[entry.commit]
-        size_bytes = len(self._state.commits[commit].new.diff[key])
-        return Contribution(seq, entry.kind, commit, size_bytes)
+        new = self._state.commits[commit].new
+        return Contribution(seq, entry.kind, commit, len(new.diff[key]), new.epoch)
 
     def _log_entry(self, seq: int, entry: Entry) -> LogEntry:
         kept = self._state.commits[self._state.ids[entry.commit]]

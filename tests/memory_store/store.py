@@ -19,6 +19,7 @@ from tests.memory_store.tokens import MemoryAuditLog, MemoryTokens
 
 from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.ids import Author, CommitId, Incarnation, RobotName
+from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import CairnError, NotFoundError, UnreachableError
 from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
@@ -54,14 +55,17 @@ class MemoryStore:
         self.shares = MemoryShares(self._maps)
         self.notes = MemoryNotes(self._maps)
 
-    def create_map(self, name: str, geometry: Geometry, sensor_model: SensorModel) -> tuple[MapRow, bool]:
+    def create_map(
+        self, name: str, geometry: Geometry, sensor_model: SensorModel, epoch_s: int | None = None
+    ) -> tuple[MapRow, bool]:
         """The map and whether it is new; an equal one may exist already."""
+        layer = MapLayer(geometry=geometry, epoch_s=epoch_s)
         with self._maps.locked() as maps:
             known = maps.get(name)
             if known is None:
-                maps[name] = new_memory_map(len(maps) + 1, name, geometry, sensor_model)
+                maps[name] = new_memory_map(len(maps) + 1, name, layer, sensor_model)
             else:
-                check_same_map(name, (known.row.geometry, known.row.sensor_model), (geometry, sensor_model))
+                check_same_map(name, (known.row.layer, known.row.sensor_model), (layer, sensor_model))
             return maps[name].row, known is None
 
     def map(self, name: str) -> MapRow:

@@ -103,7 +103,7 @@ class OwnMaps:
             self._service.store.map(upstream.name)
         except NotFoundError:
             self._check_place()
-        request = CreateMap(geometry=upstream.geometry, sensor_model=upstream.sensor_model)
+        request = CreateMap(geometry=upstream.geometry, sensor_model=upstream.sensor_model, epoch_s=upstream.epoch_s)
         _, is_new = self._service.maps.create(upstream.name, request)
         if is_new:
             self._service.store.audit_log.add(UPSTREAM.name, "create_map", upstream.name)

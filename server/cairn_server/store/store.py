@@ -14,6 +14,7 @@ from typing import Protocol
 from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.ids import Author, CommitId, Incarnation
 from cairn_map.commits.version_vector import VersionVector
+from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import ConflictError
 from cairn_map.evidence.fingerprint import Fingerprint
 from cairn_map.evidence.grid import CellKey, Geometry
@@ -333,22 +334,31 @@ class AuditLog(Protocol):
         ...
 
 
-def check_same_map(name: str, known: tuple[Geometry, SensorModel], asked: tuple[Geometry, SensorModel]) -> None:
+def check_same_map(name: str, known: tuple[MapLayer, SensorModel], asked: tuple[MapLayer, SensorModel]) -> None:
     """Refuse to make a map of a name that another one has.
 
     Raises:
         ConflictError: kind `map_exists`.
     """
-    if known[0] != asked[0]:
+    way_out = "Use it as it is, or take another name"
+    (layer, sensor_model), (other_layer, other_model) = known, asked
+    if layer.geometry != other_layer.geometry:
+        raise ConflictError(
+            "map_exists", f"map {name} exists with {layer.geometry}; asked for were {other_layer.geometry}. {way_out}"
+        )
+    if layer.epoch_s != other_layer.epoch_s:
         raise ConflictError(
             "map_exists",
-            f"map {name} exists with {known[0]}; asked for were {asked[0]}. Use it as it is, or take another name",
+            f"map {name} exists {_epochs_text(layer)}; asked for was one {_epochs_text(other_layer)}. {way_out}",
         )
-    if known[1] != asked[1]:
+    if sensor_model != other_model:
         raise ConflictError(
-            "map_exists",
-            f"map {name} exists with {known[1]!r}; asked for was {asked[1]!r}. Use it as it is, or take another name",
+            "map_exists", f"map {name} exists with {sensor_model!r}; asked for was {other_model!r}. {way_out}"
         )
+
+
+def _epochs_text(layer: MapLayer) -> str:
+    return "without epochs" if layer.epoch_s is None else f"with epochs of {layer.epoch_s} s"
 
 
 class Store(Protocol):
@@ -404,11 +414,19 @@ class Store(Protocol):
         """Notes that several servers of this store share; None: one process has it, and keeps such things itself."""
         ...
 
-    def create_map(self, name: str, geometry: Geometry, sensor_model: SensorModel) -> tuple[MapRow, bool]:
+    def create_map(
+        self, name: str, geometry: Geometry, sensor_model: SensorModel, epoch_s: int | None = None
+    ) -> tuple[MapRow, bool]:
         """Create a map unless an equal one exists; the map, and whether it is new.
 
+        Args:
+            name: of the map.
+            geometry: its grid and channels.
+            sensor_model: constants by which its evidence is read.
+            epoch_s: length of an epoch, seconds; None: one sum for all times.
+
         Raises:
-            ConflictError: one of that name exists with another geometry or sensor model.
+            ConflictError: one of that name exists with another geometry, sensor model or length of epochs.
         """
         ...
 

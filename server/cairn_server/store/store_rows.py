@@ -8,6 +8,8 @@ from typing import NamedTuple
 from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.ids import Author, CommitId
 from cairn_map.commits.version_vector import VersionVector
+from cairn_map.epochs.epoch import BASE, Epoch
+from cairn_map.epochs.layer import MapLayer
 from cairn_map.evidence.fingerprint import Fingerprint
 from cairn_map.evidence.grid import CellKey, Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
@@ -28,6 +30,13 @@ class MapRow:
     sensor_model: SensorModel
     seal_key: bytes = field(default=b"", repr=False)
     """Key by which the server recognizes the retracts that it made."""
+    epoch_s: int | None = None
+    """Length of an epoch, seconds; None: one sum for all times."""
+
+    @property
+    def layer(self) -> MapLayer:
+        """Definition of its evidence: the grid and the length of an epoch."""
+        return MapLayer(geometry=self.geometry, epoch_s=self.epoch_s)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,6 +63,8 @@ class NewCommit:
     """Name of the token of the relay that handed it over."""
     grounds: Grounds = OWN_WORD
     """Grounds on which it speaks for its author."""
+    epoch: Epoch = BASE
+    """Epoch of all its evidence."""
 
 
 CAPTURED_AHEAD_MAX_S = 600.0
@@ -76,6 +87,8 @@ class StoredCommit:
     signatures: str | None = None
     due_from: int | None = None
     """Index in `retracts` of the first commit still to be taken out, while the retract is under way; None otherwise."""
+    epoch: Epoch = BASE
+    """Epoch of its evidence; known, too, once that and its meta were dropped."""
 
 
 class NamedCommit(NamedTuple):
@@ -101,6 +114,8 @@ class Contribution:
     commit: CommitId
     size_bytes: int
     """Size of what the commit adds to the cell."""
+    epoch: Epoch = BASE
+    """Epoch to which the commit adds it."""
 
     @property
     def author(self) -> Author:
@@ -127,6 +142,8 @@ class CellRow:
     """Newest log entry whose evidence was dropped; a fold does not change it."""
     hottest_k: float | None = None
     """Hottest temperature (`cell_order.hottest_k`); None, too, of cells unchanged since before it was stored."""
+    history_bytes: int = 0
+    """Bytes, of `size_bytes`, of the rows that are older than the cell's newest one."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -202,6 +219,8 @@ class Totals:
     commits: int = 0
     branches: int = 0
     corner_cells: tuple[tuple[int, int, int], tuple[int, int, int]] | None = None
+    history_bytes: int = 0
+    """Bytes, of `size_bytes`, of rows that are older than the newest one of their cell."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -318,6 +337,10 @@ class StoreFigures:
     """Times that the write-ahead log was emptied."""
     failures: dict[str, int]
     """Transactions that were not written, by kind of error."""
+    cells_bytes: int
+    """Bytes of the cells of all maps."""
+    history_bytes: int
+    """Bytes, of these, of rows that are older than the newest one of their cell."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

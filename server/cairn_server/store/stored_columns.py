@@ -4,6 +4,7 @@ import json
 from typing import Any
 
 from cairn_map.commits.ids import CommitId, commit_id_from_text
+from cairn_map.epochs.epoch import BASE, Epoch
 from cairn_map.evidence.fingerprint import fingerprint_from_bytes
 from cairn_map.evidence.grid import CellKey
 from cairn_map.wire.messages import LogEntry
@@ -12,7 +13,7 @@ from cairn_server.store.store_rows import CellRow
 
 def cell_row(columns: tuple[Any, ...]) -> CellRow:
     """A cell from its columns, body and stamps last or left out."""
-    key, lm, digest, fingerprint, voxels, size_bytes, gone_seq, hottest_k, *rest = columns
+    key, lm, digest, fingerprint, voxels, size_bytes, gone_seq, hottest_k, history_bytes, *rest = columns
     return CellRow(
         key=CellKey(key),
         lm=lm,
@@ -24,7 +25,18 @@ def cell_row(columns: tuple[Any, ...]) -> CellRow:
         gone_seq=gone_seq,
         size_bytes=size_bytes,
         hottest_k=hottest_k,
+        history_bytes=history_bytes,
     )
+
+
+def epoch_to_column(epoch: Epoch) -> int | None:
+    """An epoch as it is stored; None: the base, as of all commits of before there were epochs."""
+    return None if epoch == BASE else int(epoch)
+
+
+def epoch_from_column(column: int | None) -> Epoch:
+    """The epoch that a column states."""
+    return BASE if column is None else Epoch(column)
 
 
 def ids_from_text(text: str) -> tuple[CommitId, ...]:

@@ -1,7 +1,7 @@
 """Tiles: groups of 4^3 cells, and sums over them, so that no request reads a row for each cell of a map.
 
-    map     totals: cells, bytes, sum of fingerprints, corner cells
-    tile    newest change, cells, bytes, sum of fingerprints of its 64 cells
+    map     totals: cells, bytes, those of history, sum of fingerprints, corner cells
+    tile    newest change, cells, bytes, those of history, sum of fingerprints of its 64 cells
     cell
 
 A fold and a heal keep them up in the transaction that writes the cells. The cells that changed since a log entry are
@@ -90,6 +90,8 @@ class TileSums:
     """Bytes of these cells, encoded."""
     fingerprint: Fingerprint = ZERO
     """Sum of their fingerprints."""
+    history_bytes: int = 0
+    """Bytes, of these, of rows that are older than the newest one of their cell."""
 
     def __add__(self, more: "TileSums") -> "TileSums":
         return TileSums(
@@ -97,6 +99,7 @@ class TileSums:
             self.cells + more.cells,
             self.size_bytes + more.size_bytes,
             self.fingerprint + more.fingerprint,
+            self.history_bytes + more.history_bytes,
         )
 
     def __sub__(self, less: "TileSums") -> "TileSums":
@@ -105,18 +108,20 @@ class TileSums:
             self.cells - less.cells,
             self.size_bytes - less.size_bytes,
             self.fingerprint - less.fingerprint,
+            self.history_bytes - less.history_bytes,
         )
 
 
 def change_of(before: CellRow | None, after: CellRow) -> TileSums:
     """Change of the sums by a cell that is written."""
     was, now = bool(before and before.voxels), bool(after.voxels)
-    size_before = before.size_bytes if before and was else 0
+    size_before, history_before = (before.size_bytes, before.history_bytes) if before and was else (0, 0)
     return TileSums(
         after.lm,
         now - was,
         (after.size_bytes if now else 0) - size_before,
         after.fingerprint - (before.fingerprint if before else ZERO),
+        (after.history_bytes if now else 0) - history_before,
     )
 
 

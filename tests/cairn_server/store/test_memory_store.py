@@ -13,6 +13,7 @@ from tests.fixtures.server.answers import kind_of
 from tests.fixtures.server.branch_contract import BranchContract
 from tests.fixtures.server.commit_contract import CommitContract
 from tests.fixtures.server.crowd_contract import CrowdContract
+from tests.fixtures.server.epoch_contract import EpochContract
 from tests.fixtures.server.evidence_contract import EvidenceContract
 from tests.fixtures.server.fetching import fetch
 from tests.fixtures.server.live import Live
@@ -47,6 +48,7 @@ class TestMemoryStore(
     SharesContract,
     CrowdContract,
     EvidenceContract,
+    EpochContract,
     BranchContract,
     AccessContract,
     AdmissionContract,

@@ -1,6 +1,7 @@
 """Stores of older versions, as they were written then, open and go on."""
 
 import json
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,6 +11,8 @@ import pytest
 from tests.fixtures.map.made import SMALL
 from tests.fixtures.server import signatures
 from tests.fixtures.server.answers import kind_of
+from tests.fixtures.server.commit_contract import bodies, folded_map
+from tests.fixtures.server.epoch_contract import EPOCHS, cell_of, commit_in, fold_by_hand, map_with_epochs, totals_of
 from tests.fixtures.server.live import Live
 from tests.fixtures.server.old_stores import FORMATS, OLD_COMMITS, OLD_RETRACTS, unpacked
 from tests.fixtures.server.pushes import KEYS, MOLE, WREN, pushed, read, sum_of
@@ -19,6 +22,8 @@ from tests.fixtures.server.store_contract import new_of
 from cairn_map.commits.ids import Author, Incarnation
 from cairn_map.errors import BadInputError, DeniedError
 from cairn_map.evidence.evidence import COUNT_MAX, SUM_MAX, packed_evidence
+from cairn_server.folding.cell_cache import CellCache
+from cairn_server.folding.folding import fold_pending
 from cairn_server.store import shares
 from cairn_server.store.admission import Grounds
 from cairn_server.store.sqlite import schema
@@ -45,6 +50,7 @@ def test_an_older_store_opens_with_all_that_it_held_and_goes_on(name: str, tmp_p
             seq = snapshot.head.seq
         assert read(live.cells(row)) == sum_of([*OLD_COMMITS, *OLD_RETRACTS])
         assert {cell.hottest_k for cell in rows_of(live)} == {None}  # no version wrote down how hot they are
+        assert (row.epoch_s, {cell.history_bytes for cell in rows_of(live)}) == (None, {0})
         assert [branch.name for branch in live.service.store.branches(row)] == ["mole"]
         assert live.push(row, OLD_COMMITS[2]).status_code == 200
         assert live.push(row, more).status_code == 201
@@ -54,6 +60,46 @@ def test_an_older_store_opens_with_all_that_it_held_and_goes_on(name: str, tmp_p
         assert read(live.cells(row)) == sum_of([*OLD_COMMITS, *OLD_RETRACTS, more])
     with Live(tmp_path) as live:  # and once more, now as a store of this version
         assert read(live.cells(live.service.store.map("lab"))) == sum_of([*OLD_COMMITS, *OLD_RETRACTS, more])
+
+
+WITHOUT_EPOCHS = """
+DROP INDEX cell_listed;
+ALTER TABLE map DROP COLUMN epoch_s;
+ALTER TABLE map DROP COLUMN history_bytes;
+ALTER TABLE commits DROP COLUMN epoch;
+ALTER TABLE cell DROP COLUMN history_bytes;
+ALTER TABLE tile DROP COLUMN history_bytes;
+CREATE INDEX cell_listed ON cell (map, cell, lm, digest, fingerprint, voxels, size_bytes, gone_seq, hottest_k);
+PRAGMA user_version = 15;
+"""
+"""SQL that takes the step of epochs back."""
+
+
+def test_a_store_of_before_epochs_opens_as_it_was_and_takes_maps_with_them(tmp_path: Path) -> None:
+    def state(store: SqliteStore) -> tuple[object, ...]:
+        row = store.map(name)
+        with store.snapshot(row) as snapshot:
+            cells = [snapshot.cell(cell.key) for cell in snapshot.cells()]
+            return row, snapshot.head, cells, snapshot.totals(), store.pending(row, limit=9, size_bytes_max=1 << 30)
+
+    with closing(SqliteStore(tmp_path)) as store:
+        row = folded_map(store, pushed(0, 0), pushed(1, 1))
+        store.append(row, new_of(pushed(2, 2)))
+        name = row.name
+        before = state(store)
+    connection = apsw.Connection(str(tmp_path / FILE_NAME))
+    connection.execute(WITHOUT_EPOCHS)
+    connection.close()
+    with closing(SqliteStore(tmp_path)) as store:
+        assert state(store) == before
+        with_epochs = map_with_epochs(store)
+        store.append(with_epochs, commit_in(EPOCHS[3], 0))
+        fold_by_hand(store, with_epochs, [cell_of(KEYS[0], lm=1, history_bytes=7)])
+        store.append(row, new_of(pushed(3, 0)))
+        assert fold_pending(store, row, CellCache(SMALL), limit=9) == 2
+    with closing(SqliteStore(tmp_path)) as store:
+        assert read(bodies(store, row)) == sum_of([pushed(n, n) for n in range(3)] + [pushed(3, 0)])
+        assert totals_of(store, store.map(with_epochs.name)).history_bytes == 7
 
 
 @pytest.mark.parametrize("version", range(len(STEPS)))

@@ -5,24 +5,27 @@ import socket
 import threading
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import replace
 
 import pytest
 from tests.fixtures.map.made import SMALL
 from tests.fixtures.server.commit_contract import bodies, folded_map, new_map
 from tests.fixtures.server.crowd_contract import all_at_once
 from tests.fixtures.server.deadline import until
+from tests.fixtures.server.epoch_contract import EPOCHS, cell_of, commit_in, fold_by_hand, map_with_epochs, totals_of
 from tests.fixtures.server.postgres import PASSWORD, Database, PostgresServer, new_database
-from tests.fixtures.server.pushes import WREN, pushed, read, sum_of
+from tests.fixtures.server.pushes import KEYS, WREN, pushed, read, sum_of
 from tests.fixtures.server.store_contract import new_of
 
-from cairn_map.errors import BadInputError, CairnError, UnreachableError
+from cairn_map.errors import BadInputError, CairnError, ConflictError, UnreachableError
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.folding.cell_cache import CellCache
 from cairn_server.folding.folding import fold_pending
 from cairn_server.store.postgres import schema
 from cairn_server.store.postgres.connections import connect
-from cairn_server.store.postgres.schema import STEPS, Step
+from cairn_server.store.postgres.schema import EPOCHS_OLDEST, STEPS, Step
 from cairn_server.store.postgres.store import PgStore
+from cairn_server.store.replica_notes import NotedServer
 
 pytestmark = [pytest.mark.processes, pytest.mark.slow]
 
@@ -92,6 +95,62 @@ def test_a_store_of_the_first_step_takes_those_that_it_lacks(
     with closing(PgStore(postgres_database.url)) as store:
         folded_map(store, pushed(0, 0))
     assert postgres_database.execute("SELECT * FROM cairn_schema") == [(len(STEPS), STEPS[-1].oldest)]
+
+
+WITHOUT_EPOCHS = """
+ALTER TABLE map DROP COLUMN epoch_s;
+ALTER TABLE commits DROP COLUMN epoch;
+ALTER TABLE touched DROP COLUMN epoch;
+ALTER TABLE head DROP COLUMN history_bytes;
+ALTER TABLE cell DROP COLUMN history_bytes;
+ALTER TABLE tile DROP COLUMN history_bytes;
+ALTER TABLE server DROP COLUMN step;
+UPDATE cairn_schema SET version = 5;
+"""
+"""SQL that takes the step of epochs back."""
+
+
+def test_a_store_of_before_epochs_opens_as_it_was_and_takes_maps_with_them(postgres_database: Database) -> None:
+    def state(store: PgStore) -> tuple[object, ...]:
+        row = store.map(name)
+        with store.snapshot(row) as snapshot:
+            cells = [snapshot.cell(cell.key) for cell in snapshot.cells()]
+            return row, snapshot.head, cells, snapshot.totals(), store.pending(row, limit=9, size_bytes_max=1 << 30)
+
+    with closing(PgStore(postgres_database.url)) as store:
+        row = folded_map(store, pushed(0, 0), pushed(1, 1))
+        store.append(row, new_of(pushed(2, 2)))
+        name = row.name
+        before = state(store)
+    postgres_database.execute(WITHOUT_EPOCHS)
+    with closing(PgStore(postgres_database.url)) as store:
+        assert state(store) == before
+        assert postgres_database.execute("SELECT oldest FROM cairn_schema") == [(1,)]
+        with_epochs = map_with_epochs(store)
+        store.append(with_epochs, commit_in(EPOCHS[3], 0))
+        fold_by_hand(store, with_epochs, [cell_of(KEYS[0], lm=1, history_bytes=7)])
+        assert totals_of(store, with_epochs).history_bytes == 7
+        assert fold_pending(store, row, CellCache(SMALL), limit=9) == 1
+        assert read(bodies(store, row)) == sum_of([pushed(n, n) for n in range(3)])
+
+
+def test_a_map_with_epochs_bars_programs_that_do_not_know_them_those_at_work_first(
+    store: PgStore, postgres_database: Database
+) -> None:
+    new_map(store)
+    assert postgres_database.execute("SELECT oldest FROM cairn_schema") == [(1,)]
+    sign = NotedServer(id="a" * 16, answers=True, folds=True, version="1.0", folded_s=None)
+    store.replicas.servers.put(sign, wall_s=0.0)
+    store.replicas.servers.put(replace(sign, id="b" * 16), wall_s=0.0)
+    postgres_database.execute(f"UPDATE server SET step = NULL WHERE id = '{'b' * 16}'")  # as one of before says it
+    count = len(store.maps())
+    with pytest.raises(ConflictError) as refused:
+        map_with_epochs(store)
+    assert refused.value.kind == "older_servers" and "(1)" in refused.value.message
+    assert len(store.maps()) == count
+    store.replicas.servers.remove("b" * 16)
+    map_with_epochs(store)
+    assert postgres_database.execute("SELECT oldest FROM cairn_schema") == [(EPOCHS_OLDEST,)]
 
 
 def test_a_step_that_fails_leaves_the_store_as_it_was(

@@ -18,6 +18,7 @@ from tests.fixtures.server.admission_contract import AdmissionContract
 from tests.fixtures.server.branch_contract import BranchContract, branch, token
 from tests.fixtures.server.commit_contract import CommitContract
 from tests.fixtures.server.crowd_contract import CrowdContract
+from tests.fixtures.server.epoch_contract import EpochContract
 from tests.fixtures.server.evidence_contract import EvidenceContract
 from tests.fixtures.server.pushes import MOLE, WREN, pushed
 from tests.fixtures.server.shares_contract import SharesContract, author_of
@@ -60,6 +61,7 @@ class TestSqliteStore(
     SharesContract,
     CrowdContract,
     EvidenceContract,
+    EpochContract,
     BranchContract,
     AccessContract,
     AdmissionContract,

@@ -105,7 +105,11 @@ def _info(args: argparse.Namespace) -> int:
         say(json.dumps({**info.model_dump(mode="json"), "branch_list": branch_json}))
         return 0
     create.say_map(info)
-    say(f"{info.cells} cells, {shown_bytes(info.size_bytes)}, {info.commits} commits; head {info.cursor}")
+    size = shown_bytes(info.size_bytes)
+    if info.epoch_s is not None:
+        present, history = info.size_bytes - info.history_bytes, info.history_bytes
+        size += f" ({shown_bytes(present)} of the present, {shown_bytes(history)} of history)"
+    say(f"{info.cells} cells, {size}, {info.commits} commits; head {info.cursor}")
     if info.box_m:
         low, high = ("  ".join(f"{value:.2f}" for value in corner) for corner in info.box_m)
         say(f"cells span ({low}) m to ({high}) m")

@@ -1,7 +1,7 @@
 """`cairn map create`: a new map, empty or from prior data: a folder of cells, or another map.
 
 Prior data are the map's first commits, of author `initial`. They are commits like any other: every robot gets them by
-ordinary sync, and a retract takes them out again.
+ordinary sync, and a retract takes them out again. They state no time, so they are older than every epoch.
 """
 
 import argparse
@@ -18,6 +18,7 @@ from cairn_map.codec.cell_code import DecodedCell, cell_digest
 from cairn_map.codec.history_code import DecodedHistory
 from cairn_map.commits.commit import Commit, CommitMeta, make_commit
 from cairn_map.commits.ids import INITIAL, Author, CommitId, Incarnation
+from cairn_map.epochs.epoch import EPOCH_S_MAX, STANDARD_EPOCH_S
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.channels import COLOUR, INTENSITY, STANDARD_CHANNELS, TEMPERATURE, Channel, ChannelKind
 from cairn_map.evidence.grid import Geometry, geometry_for
@@ -38,6 +39,17 @@ FILE_KINDS = {
 }
 """Kinds of files that one may take for a map, by their suffix."""
 VOXEL_M = 0.04
+DEFAULT_EPOCH_S: int | None = None
+"""Length of an epoch in maps that are made here, seconds; `STANDARD_EPOCH_S` once servers fold evidence by epoch."""
+NO_EPOCHS = "none"
+EPOCH_HELP = (
+    "seconds of capture whose evidence is one sum. Sums of different epochs are kept apart, and newer ones outweigh "
+    "older: what came or went shows in the next epoch, and the map as it was, and what changed since, can be asked "
+    "for. Each epoch in which a cell is seen costs about the bytes of one pass (`cairn map info` shows them); shorter "
+    f"epochs notice sooner. {STANDARD_EPOCH_S} suits people, doors and goods. `{NO_EPOCHS}`: one sum for all times, "
+    "with the fewest bytes, for scenes that stand still, since a wall seen 200 times and then gone stays for 200 "
+    "scans. Fixed for the map's life"
+)
 CHANNELS = {"colour": COLOUR, "intensity": INTENSITY, "temperature": TEMPERATURE}
 
 
@@ -48,6 +60,9 @@ def add_parser(commands: Subparsers) -> None:
     create.add_argument(
         "--channels", help="colour,intensity,temperature, or those of --from; scalars as NAME:UNIT:STEP; '' for none"
     )
+    default = NO_EPOCHS if DEFAULT_EPOCH_S is None else DEFAULT_EPOCH_S
+    text = f"{EPOCH_HELP} ({default}, or that of --from)"
+    create.add_argument("--epoch", metavar=f"SECONDS|{NO_EPOCHS}", help=text)
     create.add_argument("--from", dest="source", metavar="DIR|URL", help="folder of cells, or another map's URL")
 
 
@@ -56,27 +71,30 @@ def _create(args: argparse.Namespace) -> int:
     api, name = api_of(args.map, tokens)
     if args.source is not None:
         # A grid that is asked for as well has to be the source's: evidence cannot be moved to another one.
-        asked = _Asked(args.voxel, None if args.channels is None else _channels(args.channels))
+        asked = _Asked(args.voxel, None if args.channels is None else _channels(args.channels), args.epoch)
         with api:
-            info, count, added = push_prior_data(api, name, args.source, tokens=tokens, check=asked.check)
+            info, count, added = push_prior_data(
+                api, name, args.source, tokens=tokens, check=asked.check, epoch_s=asked.epoch_s
+            )
         say_map(info)
         say(f"started from {args.source}: {count} cells, as the commit of author `initial`")
         if added < count:
             say(f"{count - added} of them were pushed before, and are not added again (nor if they were retracted)")
         return 0
     with api:
-        made = api.create_map(name, CreateMap(geometry=_geometry(args)))
+        made = api.create_map(name, CreateMap(geometry=_geometry(args), epoch_s=_epoch_s(args.epoch)))
     say_map(made)
     return 0
 
 
 def say_map(info: MapInfo) -> None:
-    """Write a line about a map: its voxels, cells and channels."""
+    """Write a line about a map: its voxels, cells, channels and epochs."""
     geometry = info.geometry
     names = ", ".join(channel.name for channel in geometry.channels) or "none but occupancy"
+    epochs = "" if info.epoch_s is None else f", epochs of {info.epoch_s} s"
     say(
         f"map {info.name}: voxels of {shown_length(geometry.voxel_edge_m)}, "
-        f"cells of {geometry.cell_edge_m:g} m, channels {names}"
+        f"cells of {geometry.cell_edge_m:g} m, channels {names}{epochs}"
     )
 
 
@@ -87,13 +105,15 @@ def push_prior_data(
     *,
     tokens: OriginTokens = NO_TOKENS,
     check: Callable[[Geometry], None] = lambda _: None,
+    epoch_s: Callable[[int | None], int | None] = lambda source: source,
 ) -> tuple[MapInfo, int, int]:
     """Create a map with the grid and the evidence of a folder or another map; returns it, the
     count of cells, and how many of them were added.
 
     A source that is a URL is read with the token that `tokens` has for its server. It may be repeated after a cut
     link: evidence that is there already is not added again. `check` may refuse the source's grid, before anything
-    is made.
+    is made. `epoch_s` is the length of the new map's epochs, of that of the source: the evidence comes as one sum
+    without a time, which fits any.
 
     Raises:
         BadInputError: the source is neither a folder of cells nor a map's URL.
@@ -101,7 +121,8 @@ def push_prior_data(
     """
     head, cells = _open(source, tokens)
     check(head.geometry)
-    api.create_map(name, CreateMap(geometry=head.geometry, sensor_model=head.sensor_model))
+    wanted = CreateMap(geometry=head.geometry, sensor_model=head.sensor_model, epoch_s=epoch_s(head.epoch_s))
+    api.create_map(name, wanted)
     count = added = 0
     author: Author | None = None
     for n, group in enumerate(_groups(cells)):
@@ -126,7 +147,8 @@ def _open(source: str, tokens: OriginTokens) -> tuple[FolderHead, Iterable[Decod
         return head, _totals(read_cells(folder, head.layer))
     api, name = api_of(source, tokens)
     info = api.map_info(name)
-    return FolderHead(geometry=info.geometry, sensor_model=info.sensor_model), _fetched(api, info)
+    head = FolderHead(geometry=info.geometry, sensor_model=info.sensor_model, epoch_s=info.epoch_s)
+    return head, _fetched(api, info)
 
 
 def _check_folder(folder: Path) -> None:
@@ -183,10 +205,15 @@ def _commit(commit: CommitId, cells: list[DecodedCell], geometry: Geometry) -> C
 
 @dataclass(frozen=True, slots=True)
 class _Asked:
-    """Grid that was asked for, as far as it was."""
+    """Grid and epochs that were asked for, as far as they were."""
 
     voxel_edge_m: float | None
     channels: tuple[Channel, ...] | None
+    epoch: str | None
+
+    def epoch_s(self, source_s: int | None) -> int | None:
+        """Length of an epoch, seconds: that which was asked for, else the source's."""
+        return _epoch_s(self.epoch, otherwise=source_s)
 
     def check(self, found: Geometry) -> None:
         """Refuse another grid than was asked for.
@@ -206,6 +233,23 @@ class _Asked:
 def _geometry(args: argparse.Namespace) -> Geometry:
     channels = STANDARD_CHANNELS if args.channels is None else _channels(args.channels)
     return geometry_for(voxel_edge_m=VOXEL_M if args.voxel is None else args.voxel, channels=channels)
+
+
+def _epoch_s(text: str | None, *, otherwise: int | None = DEFAULT_EPOCH_S) -> int | None:
+    """Length of an epoch, seconds, or None for a map without.
+
+    Raises:
+        BadInputError: kind `bad_epoch`.
+    """
+    if text is None:
+        return otherwise
+    if text == NO_EPOCHS:
+        return None
+    if not text.isascii() or not text.isdigit() or not 1 <= int(text) <= EPOCH_S_MAX:
+        raise BadInputError(
+            "bad_epoch", f"--epoch takes whole seconds from 1 to {EPOCH_S_MAX}, or `{NO_EPOCHS}`; got {text!r}"
+        )
+    return int(text)
 
 
 def _channels(text: str) -> tuple[Channel, ...]:

@@ -66,9 +66,13 @@ def _make_map(source: RelayApi, target: RelayApi, name: str) -> None:
     try:
         there = target.map_info(name)
     except NotFoundError:
-        there = target.create_map(name, CreateMap(geometry=info.geometry, sensor_model=info.sensor_model))
+        wanted = CreateMap(geometry=info.geometry, sensor_model=info.sensor_model, epoch_s=info.epoch_s)
+        there = target.create_map(name, wanted)
     if (there.geometry, there.sensor_model) != (info.geometry, info.sensor_model):
         raise BadInputError("other_geometry", f"map {name} is {info.geometry} here and {there.geometry} there")
+    if there.epoch_s != info.epoch_s:
+        here, other = (f"epochs of {end.epoch_s} s" if end.epoch_s else "no epochs" for end in (info, there))
+        raise BadInputError("other_geometry", f"map {name} has {here} here and {other} there: they cannot be added")
 
 
 @dataclass(slots=True)

@@ -36,7 +36,7 @@ CHANNEL = "cairn_fold"
 BATCH_BYTES = 8 << 20
 """Bytes of cells that are written by one statement."""
 BASE = """
-    SELECT cells, cells_bytes, fingerprint, corners FROM head WHERE map = %s AND seq = %s AND chain = %s
+    SELECT cells, cells_bytes, fingerprint, corners, history_bytes FROM head WHERE map = %s AND seq = %s AND chain = %s
     FOR NO KEY UPDATE"""
 """SQL that locks a map's head if it is a fold's base, and gives its totals."""
 LEAVE_OBJECTS = """
@@ -47,14 +47,16 @@ LEAVE_OBJECTS = """
 PUT_CELLS = f"""
 WITH left_objects AS ({LEAVE_OBJECTS}
 ), put AS (
-    INSERT INTO cell (map, cell, lm, digest, fingerprint, voxels, size_bytes, hottest_k, body, stamps)
+    INSERT INTO cell (map, cell, lm, digest, fingerprint, voxels, size_bytes, hottest_k, history_bytes, body, stamps)
     SELECT %(map)s, u.* FROM unnest(
         %(keys)s::bigint[], %(lms)s::bigint[], %(digests)s::bytea[], %(fingerprints)s::bytea[], %(voxels)s::bigint[],
-        %(sizes_bytes)s::bigint[], %(hottest_k)s::float8[], %(bodies)s::bytea[], %(stamps)s::bytea[]
+        %(sizes_bytes)s::bigint[], %(hottest_k)s::float8[], %(history_bytes)s::bigint[], %(bodies)s::bytea[],
+        %(stamps)s::bytea[]
     ) AS u
     ON CONFLICT (map, layer, cell) DO UPDATE SET lm = excluded.lm, digest = excluded.digest,
         fingerprint = excluded.fingerprint, voxels = excluded.voxels, size_bytes = excluded.size_bytes,
-        hottest_k = excluded.hottest_k, body = excluded.body, stamps = excluded.stamps, object = NULL
+        hottest_k = excluded.hottest_k, history_bytes = excluded.history_bytes, body = excluded.body,
+        stamps = excluded.stamps, object = NULL
 )
 {COUNTED}"""
 """SQL that writes cells; its rows are the sums (`Counted`) that they and their tiles had until then."""
@@ -67,8 +69,9 @@ WITH e AS (SELECT * FROM unnest(%(seqs)s::bigint[], %(kinds)s::bytea[], %(number
     UPDATE commits SET folded_seq = e.seq, folded_age_s = %(age_s)s::float8
     FROM e WHERE map = %(map)s AND commits.number = e.number AND e.kind = %(fold)s AND folded_seq IS NULL
 )
-INSERT INTO touched (map, layer, cell, seq, kind, robot, incarnation, n, size_bytes)
-SELECT d.map, d.layer, d.cell, e.seq, e.kind, c.robot, c.incarnation, c.n, coalesce(octet_length(d.body), d.size_bytes)
+INSERT INTO touched (map, layer, cell, seq, kind, robot, incarnation, n, size_bytes, epoch)
+SELECT d.map, d.layer, d.cell, e.seq, e.kind, c.robot, c.incarnation, c.n, coalesce(octet_length(d.body), d.size_bytes),
+    c.epoch
 FROM e JOIN commits AS c ON c.map = %(map)s AND c.number = e.number
     JOIN diff AS d ON d.map = c.map AND d.commit_number = c.number"""
 """SQL that writes a fold's log entries, what they touch, and which commits are folded by them."""
@@ -125,10 +128,10 @@ def heal_cell(connection: Connection, row: MapRow, cell: CellRow, *, age_s: floa
     # Stamps that are lost with an object count as if all of the cell had changed with its last entry.
     connection.execute(
         "UPDATE cell SET digest = %s, fingerprint = %s, voxels = %s, size_bytes = %s, body = %s, hottest_k = %s,"
-        " stamps = coalesce(stamps, %s), object = NULL WHERE map = %s AND layer = 0 AND cell = %s",
+        " history_bytes = %s, stamps = coalesce(stamps, %s), object = NULL WHERE map = %s AND layer = 0 AND cell = %s",
         (
             *(cell.digest, cell.fingerprint.to_bytes(), cell.voxels, cell.size_bytes, cell.body, cell.hottest_k),
-            *(cell.stamps, row.number, cell.key),
+            *(cell.history_bytes, cell.stamps, row.number, cell.key),
         ),
     )
     recount_tile(connection, row.number, tile_of(cell.key))
@@ -242,6 +245,7 @@ def _put_cells(connection: Connection, row: MapRow, cells: list[CellRow], *, age
         "voxels": [cell.voxels for cell in cells],
         "sizes_bytes": [cell.size_bytes for cell in cells],
         "hottest_k": [cell.hottest_k for cell in cells],
+        "history_bytes": [cell.history_bytes for cell in cells],
         "bodies": [cell.body for cell in cells],
         "stamps": [cell.stamps for cell in cells],
     }

@@ -100,6 +100,8 @@ class PgHealth:
         """Sizes and counts."""
         with self._connections.lent() as connection:
             size_bytes = first(connection, SIZE)
+            sums = "SELECT coalesce(sum(cells_bytes), 0)::bigint, coalesce(sum(history_bytes), 0)::bigint FROM head"
+            cells_bytes, history_bytes = first(connection, sums)
         return StoreFigures(
             size_bytes=size_bytes,
             ahead_bytes=0,
@@ -108,6 +110,8 @@ class PgHealth:
             written=self._connections.written,
             emptied=0,
             failures=dict(self._connections.failures),
+            cells_bytes=cells_bytes,
+            history_bytes=history_bytes,
         )
 
     def check_space(self, free_bytes_min: int) -> None:

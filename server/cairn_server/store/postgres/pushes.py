@@ -18,15 +18,16 @@ from cairn_server.store.postgres.robot_keys import admit_commit
 from cairn_server.store.postgres.schema import NOW_S
 from cairn_server.store.postgres.shares import CHARGE, charge_of, check_charge, lock_head, note_number
 from cairn_server.store.store_rows import MapRow, NewCommit
+from cairn_server.store.stored_columns import epoch_to_column
 
 KEEP = f"""
     INSERT INTO commits (
         map, robot, incarnation, n, sha, size_bytes, cells, bricks, meta, captured_first_s, captured_last_s, retracts,
-        rig, signatures, via, regions, tops, received_s, received_age_s
+        rig, signatures, via, regions, tops, received_s, received_age_s, epoch
     )
     SELECT %(map)s, %(robot)s, %(incarnation)s, %(n)s, %(sha)s, %(size_bytes)s, %(cells)s, %(bricks)s, %(meta)s,
         %(first_s)s::float8, %(last_s)s::float8, %(retracts)s, %(rig)s::bytea, %(signatures)s, %(via)s,
-        %(regions)s::bigint[], %(tops)s::bigint[], {NOW_S}, %(age_s)s::float8
+        %(regions)s::bigint[], %(tops)s::bigint[], {NOW_S}, %(age_s)s::float8, %(epoch)s::bigint
     {{source}}
     RETURNING number"""
 """SQL that keeps a commit without its diff."""
@@ -134,6 +135,7 @@ def _values(row: MapRow, commit: NewCommit, age_s: float) -> dict[str, Any]:
         "signatures": commit.signatures,
         "via": commit.via,
         "age_s": age_s,
+        "epoch": epoch_to_column(commit.epoch),
         **_bodies(commit),
         **charge_of(commit.id, commit.tops, 2 + row.geometry.plane_count),
     }

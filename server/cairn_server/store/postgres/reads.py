@@ -17,10 +17,10 @@ from cairn_server.store.postgres.retention import is_retracted
 from cairn_server.store.postgres.schema import IS_WAITING
 from cairn_server.store.postgres.snapshot import OF_COMMIT, PgSnapshot
 from cairn_server.store.store_rows import MapRow, StoredCommit
-from cairn_server.store.stored_columns import ids_from_text
+from cairn_server.store.stored_columns import epoch_from_column, ids_from_text
 
 STORED = """
-SELECT c.number, robot, incarnation, n, sha, meta, retracts, gone, c.due_from, signatures, d.*
+SELECT c.number, robot, incarnation, n, sha, meta, retracts, gone, c.due_from, signatures, c.epoch, d.*
 FROM {commits} AS c LEFT JOIN LATERAL (
     SELECT array_agg(cell ORDER BY cell), array_agg(body ORDER BY cell), array_agg(segment ORDER BY cell),
         array_agg(start_bytes ORDER BY cell), array_agg(size_bytes ORDER BY cell)
@@ -59,6 +59,7 @@ class _StoredColumns(NamedTuple):
     gone: bool
     due_from: int | None
     signatures: str | None
+    epoch: int | None
     cells: list[int] | None
     """Cells of its diff, and below what is stored of each; None: no evidence is kept, or it is not needed."""
     bodies: list[bytes] | None
@@ -173,14 +174,15 @@ class PgReads:
         # In a store that was restored the number may be another map's.
         unknown = [number for number, key in found if number not in self._maps or self._maps[number].seal_key != key]
         if unknown:
-            query = "SELECT map, name, geometry, sensor_model, seal_key FROM map WHERE map = ANY(%s)"
-            for number, name, geometry, sensor_model, seal_key in rows(connection, query, (unknown,)):
+            query = "SELECT map, name, geometry, sensor_model, seal_key, epoch_s FROM map WHERE map = ANY(%s)"
+            for number, name, geometry, sensor_model, seal_key, epoch_s in rows(connection, query, (unknown,)):
                 self._maps[number] = MapRow(
                     number=number,
                     name=name,
                     geometry=Geometry.model_validate_json(geometry),
                     sensor_model=SensorModel.model_validate_json(sensor_model),
                     seal_key=seal_key,
+                    epoch_s=epoch_s,
                 )
         return [self._maps[number] for number, _ in found]
 
@@ -212,6 +214,7 @@ def _commits(connection: Connection, query: str, values: dict[str, Any], objects
             gone=each.gone,
             signatures=each.signatures,
             due_from=each.due_from,
+            epoch=epoch_from_column(each.epoch),
         )
         for each, diff in zip(found, diffs, strict=True)
     ]

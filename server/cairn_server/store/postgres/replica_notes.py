@@ -23,7 +23,7 @@ from cairn_map.errors import CairnError
 from cairn_server.store.postgres.branches import PgBranches
 from cairn_server.store.postgres.connections import Connection, Connections, connect, first, rows
 from cairn_server.store.postgres.folds import CHANNEL
-from cairn_server.store.postgres.schema import NOW_S
+from cairn_server.store.postgres.schema import NOW_S, STEPS
 from cairn_server.store.postgres.use_accounts import PgUseAccounts
 from cairn_server.store.replica_notes import (
     SERVER_S,
@@ -217,9 +217,9 @@ class PgServers:
     def put(self, sign: NotedServer, *, wall_s: float) -> None:
         """Keep the sign of a server."""
         query = (
-            "INSERT INTO server (id, answers, folds, version, clock_ahead_s, folded_at, heard_at)"
+            "INSERT INTO server (id, answers, folds, version, clock_ahead_s, folded_at, heard_at, step)"
             f" SELECT %(id)s, %(answers)s, %(folds)s, %(version)s, %(wall_s)s::float8 - {NOW_S},"
-            " clock_timestamp() - make_interval(secs => %(folded_s)s::float8), clock_timestamp()"
+            f" clock_timestamp() - make_interval(secs => %(folded_s)s::float8), clock_timestamp(), {len(STEPS)}"
             " ON CONFLICT (id) DO UPDATE SET folds = excluded.folds, clock_ahead_s = excluded.clock_ahead_s,"
             " folded_at = excluded.folded_at, heard_at = excluded.heard_at"
         )

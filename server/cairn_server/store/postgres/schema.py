@@ -349,6 +349,17 @@ ALTER TABLE object_store
     ADD COLUMN listed_age_s float8 NOT NULL DEFAULT 0; -- age of the store when all names were listed last
 CREATE INDEX dead_object_doomed ON dead_object (map, name) WHERE doomed;
 """
+EPOCHS = """
+ALTER TABLE map ADD COLUMN epoch_s bigint;          -- length of an epoch; NULL: one sum for all times
+ALTER TABLE head ADD COLUMN history_bytes bigint NOT NULL DEFAULT 0;    -- of cells_bytes: rows older than their newest
+ALTER TABLE commits ADD COLUMN epoch bigint;        -- of its evidence; NULL: the base
+ALTER TABLE touched ADD COLUMN epoch bigint;
+ALTER TABLE cell ADD COLUMN history_bytes bigint NOT NULL DEFAULT 0;    -- these two of size_bytes
+ALTER TABLE tile ADD COLUMN history_bytes bigint NOT NULL DEFAULT 0;
+ALTER TABLE server ADD COLUMN step bigint;          -- newest one that its program knows; NULL: an earlier one than this
+"""
+EPOCHS_OLDEST = 6
+"""Oldest step whose programs work on a store with a map with epochs."""
 BOUND_OLDEST = 4
 """Oldest step whose programs read a store of which bytes are in an object store."""
 
@@ -362,7 +373,7 @@ class Step:
     """Number of the oldest step whose programs work on a database that took this one."""
 
 
-STEPS = tuple(Step(sql, oldest=1) for sql in (FIRST, REPLICAS, SERVERS, OBJECTS, OWNED_OBJECTS))
+STEPS = tuple(Step(sql, oldest=1) for sql in (FIRST, REPLICAS, SERVERS, OBJECTS, OWNED_OBJECTS, EPOCHS))
 
 
 def prepare(url: str, *, has_objects: bool = False) -> None:

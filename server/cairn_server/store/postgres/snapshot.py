@@ -34,7 +34,7 @@ from cairn_server.store.store_rows import (
     Selection,
     Totals,
 )
-from cairn_server.store.stored_columns import cell_row, log_entry
+from cairn_server.store.stored_columns import cell_row, epoch_from_column, log_entry
 from cairn_server.store.tiles import Box, is_in_box
 
 OF_COMMIT = "map = %s AND robot = %s AND incarnation = %s AND n = %s"
@@ -148,13 +148,13 @@ class PgSnapshot:
     def contributions(self, key: CellKey, *, after_seq: int, newest: int | None = None) -> list[Contribution]:
         """Entries after `after_seq` that touch a cell, oldest first, at most so many of the newest."""
         query = (
-            "SELECT seq, kind, robot, incarnation, n, size_bytes FROM touched"
+            "SELECT seq, kind, robot, incarnation, n, size_bytes, epoch FROM touched"
             f" WHERE {OF_MAP} AND cell = %(key)s AND seq > %(after)s ORDER BY seq DESC LIMIT %(newest)s"
         )
         values = {"map": self._map, "key": key, "after": after_seq, "newest": newest}
         return [
-            Contribution(seq, kind, CommitId(Author(robot, incarnation), n), size_bytes)
-            for seq, kind, robot, incarnation, n, size_bytes in reversed(rows(self._connection, query, values))
+            Contribution(seq, kind, CommitId(Author(robot, incarnation), n), size_bytes, epoch_from_column(epoch))
+            for seq, kind, robot, incarnation, n, size_bytes, epoch in reversed(rows(self._connection, query, values))
         ]
 
     def named(self, commits: Sequence[CommitId]) -> list[NamedCommit]:
@@ -340,7 +340,12 @@ class PgSnapshot:
         )
         commits, branches = first(self._connection, query, {"map": self._map})
         return Totals(
-            cells=sums.cells, size_bytes=sums.size_bytes, commits=commits, branches=branches, corner_cells=corners
+            cells=sums.cells,
+            size_bytes=sums.size_bytes,
+            commits=commits,
+            branches=branches,
+            corner_cells=corners,
+            history_bytes=sums.history_bytes,
         )
 
 

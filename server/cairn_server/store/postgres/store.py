@@ -10,7 +10,8 @@ from functools import partial
 
 from cairn_map.commits.cursor import Cursor, first_chain
 from cairn_map.commits.ids import Author
-from cairn_map.errors import NotFoundError, UnreachableError
+from cairn_map.epochs.layer import MapLayer
+from cairn_map.errors import ConflictError, NotFoundError, UnreachableError
 from cairn_map.evidence.fingerprint import ZERO
 from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
@@ -25,10 +26,11 @@ from cairn_server.store.postgres.reads import PgReads
 from cairn_server.store.postgres.replica_notes import PgReplicaNotes
 from cairn_server.store.postgres.retention import forget_evidence
 from cairn_server.store.postgres.robot_keys import PgAdmittedKeys
-from cairn_server.store.postgres.schema import prepare
+from cairn_server.store.postgres.schema import EPOCHS_OLDEST, prepare
 from cairn_server.store.postgres.shares import PgShares
 from cairn_server.store.postgres.tokens import PgAuditLog, PgTokens
 from cairn_server.store.postgres.writing_threads import WritingThreads
+from cairn_server.store.replica_notes import SERVER_S
 from cairn_server.store.store import check_same_map
 from cairn_server.store.store_age import CLOCKS, AgeMark, Clocks, StoreAge
 from cairn_server.store.store_rows import Branch, Fold, MapRow, NewCommit
@@ -99,22 +101,28 @@ class PgStore(PgReads):
         self.replicas = PgReplicaNotes(url, self._connections, self._noting, self.notes)
         self._names: dict[str, tuple[MapRow, float]] = {}  # with the time until which a map is known by its name
 
-    def create_map(self, name: str, geometry: Geometry, sensor_model: SensorModel) -> tuple[MapRow, bool]:
+    def create_map(
+        self, name: str, geometry: Geometry, sensor_model: SensorModel, epoch_s: int | None = None
+    ) -> tuple[MapRow, bool]:
         """The map and whether it is new; an equal one may exist already."""
+        layer = MapLayer(geometry=geometry, epoch_s=epoch_s)
         log_id = secrets.token_bytes(16)
         # Random, not the next one: servers remember maps that a database put back to an older state has lost, and none
         # made since may have the number of one of these.
         number = 1 + secrets.randbits(NUMBER_BITS)
-        values = (number, name, geometry.model_dump_json(), sensor_model.model_dump_json(), secrets.token_bytes(32))
+        texts = geometry.model_dump_json(), sensor_model.model_dump_json()
+        values = (number, name, *texts, secrets.token_bytes(32), layer.epoch_s)
 
         def job(connection: Connection) -> bool:
             made = connection.execute(
-                "INSERT INTO map (map, name, geometry, sensor_model, seal_key) OVERRIDING SYSTEM VALUE"
-                " VALUES (%s, %s, %s, %s, %s) ON CONFLICT (name) DO NOTHING",
+                "INSERT INTO map (map, name, geometry, sensor_model, seal_key, epoch_s) OVERRIDING SYSTEM VALUE"
+                " VALUES (%s, %s, %s, %s, %s, %s) ON CONFLICT (name) DO NOTHING",
                 values,
             )
             if not made.rowcount:
                 return False
+            if layer.has_epochs:
+                _bar_older_programs(connection)
             connection.execute(
                 "INSERT INTO head (map, log_id, seq, chain, fingerprint) VALUES (%s, %s, 0, %s, %s)",
                 (number, log_id, first_chain(log_id, geometry.digest()), ZERO.to_bytes()),
@@ -123,7 +131,7 @@ class PgStore(PgReads):
 
         is_new = self._connections.run(job)
         row = self.map(name)
-        check_same_map(name, (row.geometry, row.sensor_model), (geometry, sensor_model))
+        check_same_map(name, (row.layer, row.sensor_model), (layer, sensor_model))
         return row, is_new
 
     def map(self, name: str) -> MapRow:
@@ -207,3 +215,25 @@ class PgStore(PgReads):
         self._threads.close()
         self._noting.close()
         self._connections.close()
+
+
+def _bar_older_programs(connection: Connection) -> None:
+    """Keep programs that know nothing of epochs from a store that gets its first map with them.
+
+    They would take its cells for damaged. Those that start are refused by their schema; those that run are counted.
+
+    Raises:
+        ConflictError: kind `older_servers`.
+    """
+    older = (
+        "SELECT count(*) FROM server WHERE coalesce(step, 0) < %s"
+        " AND heard_at > clock_timestamp() - make_interval(secs => %s::float8)"
+    )
+    count = first(connection, older, (EPOCHS_OLDEST, SERVER_S))
+    if count:
+        raise ConflictError(
+            "older_servers",
+            f"servers of an earlier version ({count}) work on this store and know no maps with epochs: update them "
+            "first, or make a map without epochs",
+        )
+    connection.execute("UPDATE cairn_schema SET oldest = %s WHERE oldest < %s", (EPOCHS_OLDEST, EPOCHS_OLDEST))

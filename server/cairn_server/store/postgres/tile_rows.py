@@ -23,7 +23,9 @@ from cairn_server.store.tiles import (
     touches_box,
 )
 
-CELL_COLUMNS = "cell.cell, cell.lm, digest, cell.fingerprint, voxels, cell.size_bytes, gone_seq, hottest_k"
+CELL_COLUMNS = (
+    "cell.cell, cell.lm, digest, cell.fingerprint, voxels, cell.size_bytes, gone_seq, hottest_k, cell.history_bytes"
+)
 IN_TILES = (
     "unnest(%(tiles)s::bigint[]) AS t (tile) CROSS JOIN LATERAL ("
     " SELECT * FROM cell AS c WHERE c.map = %(map)s AND c.layer = 0"
@@ -35,12 +37,13 @@ IN_TILES = (
 taken for a ninth of the table, and the whole map is read."""
 OF_MAP = "map = %(map)s AND layer = 0"
 COUNTED = f"""
-SELECT false, cell, 0::bigint, fingerprint, voxels, size_bytes FROM cell
+SELECT false, cell, 0::bigint, fingerprint, voxels, size_bytes, history_bytes FROM cell
 WHERE {OF_MAP} AND cell = ANY(%(keys)s::bigint[])
 UNION ALL
-SELECT true, tile, lm, fingerprint, cells, size_bytes FROM tile WHERE {OF_MAP} AND tile = ANY(%(tiles)s::bigint[])"""
+SELECT true, tile, lm, fingerprint, cells, size_bytes, history_bytes FROM tile
+WHERE {OF_MAP} AND tile = ANY(%(tiles)s::bigint[])"""
 """SQL of what cells and tiles are counted as (`Counted`), before the statement that it is a part of."""
-TOTALS = "cells = %s, cells_bytes = %s, fingerprint = %s, corners = %s::bigint[]"
+TOTALS = "cells = %s, cells_bytes = %s, fingerprint = %s, corners = %s::bigint[], history_bytes = %s"
 """SQL that sets a head's totals to `totals_values`."""
 
 
@@ -58,25 +61,26 @@ class Counted(NamedTuple):
     content: int
     """Voxels of a cell, cells of a tile."""
     size_bytes: int
+    history_bytes: int
 
 
 def totals_of(connection: Connection, map_number: int) -> Totals:
     """Sums over all cells of a map, and the corners of those with a voxel."""
-    query = "SELECT cells, cells_bytes, fingerprint, corners FROM head WHERE map = %s"
+    query = "SELECT cells, cells_bytes, fingerprint, corners, history_bytes FROM head WHERE map = %s"
     return totals_from(first(connection, query, (map_number,)))
 
 
 def totals_from(columns: tuple[Any, ...]) -> Totals:
-    """Totals in these columns of a head: cells, cells_bytes, fingerprint, corners."""
-    cells, size_bytes, fingerprint, corners = columns
+    """Totals in these columns of a head: cells, cells_bytes, fingerprint, corners, history_bytes."""
+    cells, size_bytes, fingerprint, corners, history_bytes = columns
     found = (tuple(corners[:3]), tuple(corners[3:])) if corners else None
-    return TileSums(0, cells, size_bytes, fingerprint_from_bytes(fingerprint)), found
+    return TileSums(0, cells, size_bytes, fingerprint_from_bytes(fingerprint), history_bytes), found
 
 
 def totals_values(sums: TileSums, corners: Corners | None) -> tuple[Any, ...]:
     """Values of `TOTALS`."""
     ends = [*corners[0], *corners[1]] if corners else None
-    return sums.cells, sums.size_bytes, sums.fingerprint.to_bytes(), ends
+    return sums.cells, sums.size_bytes, sums.fingerprint.to_bytes(), ends, sums.history_bytes
 
 
 def tiles_changed(connection: Connection, map_number: int, *, after_seq: int, box: Box | None) -> list[int]:
@@ -136,15 +140,16 @@ class PgTileWriter:
 
 def recount_tile(connection: Connection, map_number: int, tile: int) -> None:
     """Compute a tile's sums again from its cells: the row of a damaged cell does not say what it was counted as."""
-    query = f"SELECT tile, lm, fingerprint, cells, size_bytes FROM tile WHERE {OF_MAP} AND tile = %(tile)s"
+    columns = "tile, lm, fingerprint, cells, size_bytes, history_bytes"
+    query = f"SELECT {columns} FROM tile WHERE {OF_MAP} AND tile = %(tile)s"
     known = first(connection, query, {"map": map_number, "tile": tile})
     before = _tile_sums(*known) if known is not None else TileSums()
-    query = f"SELECT lm, voxels > 0, size_bytes, fingerprint FROM {IN_TILES}"
+    query = f"SELECT cell.cell, lm, fingerprint, voxels > 0, size_bytes, history_bytes FROM {IN_TILES}"
     found = rows(connection, query, {"map": map_number, "tiles": [tile]})
     after = sum(
         (
-            TileSums(lm, int(is_known), size_bytes * is_known, fingerprint_from_bytes(fingerprint))
-            for lm, is_known, size_bytes, fingerprint in found
+            _tile_sums(key, lm, fingerprint, int(is_known), size_bytes * is_known, history_bytes * is_known)
+            for key, lm, fingerprint, is_known, size_bytes, history_bytes in found
         ),
         TileSums(),
     )
@@ -163,20 +168,22 @@ def _counted(known: Counted) -> CellRow:
         voxels=known.content,
         body=b"",
         size_bytes=known.size_bytes,
+        history_bytes=known.history_bytes,
     )
 
 
-def _tile_sums(_: int, lm: int, fingerprint: bytes, cells: int, size_bytes: int) -> TileSums:
-    return TileSums(lm, cells, size_bytes, fingerprint_from_bytes(fingerprint))
+def _tile_sums(_: int, lm: int, fingerprint: bytes, cells: int, size_bytes: int, history_bytes: int) -> TileSums:
+    return TileSums(lm, cells, size_bytes, fingerprint_from_bytes(fingerprint), history_bytes)
 
 
 def _put_tiles(connection: Connection, map_number: int, tiles: dict[int, TileSums]) -> None:
     sums = list(tiles.values())
     connection.execute(
-        "INSERT INTO tile (map, tile, lm, cells, size_bytes, fingerprint)"
-        " SELECT %s, u.* FROM unnest(%s::bigint[], %s::bigint[], %s::bigint[], %s::bigint[], %s::bytea[]) AS u"
-        " ON CONFLICT (map, layer, tile) DO UPDATE SET lm = excluded.lm, cells = excluded.cells,"
-        " size_bytes = excluded.size_bytes, fingerprint = excluded.fingerprint",
+        "INSERT INTO tile (map, tile, lm, cells, size_bytes, fingerprint, history_bytes)"
+        " SELECT %s, u.* FROM unnest(%s::bigint[], %s::bigint[], %s::bigint[], %s::bigint[], %s::bytea[], %s::bigint[])"
+        " AS u ON CONFLICT (map, layer, tile) DO UPDATE SET lm = excluded.lm, cells = excluded.cells,"
+        " size_bytes = excluded.size_bytes, fingerprint = excluded.fingerprint,"
+        " history_bytes = excluded.history_bytes",
         (
             map_number,
             list(tiles),
@@ -184,6 +191,7 @@ def _put_tiles(connection: Connection, map_number: int, tiles: dict[int, TileSum
             [one.cells for one in sums],
             [one.size_bytes for one in sums],
             [one.fingerprint.to_bytes() for one in sums],
+            [one.history_bytes for one in sums],
         ),
     )
 

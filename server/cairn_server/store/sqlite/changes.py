@@ -14,6 +14,7 @@ from cairn_server.store.sqlite.snapshot import SqliteSnapshot
 from cairn_server.store.sqlite.tile_rows import TileWriter, mark_at, recount_tile
 from cairn_server.store.sqlite.writer import first
 from cairn_server.store.store_rows import CellRow, Fold, MapRow, NewCommit
+from cairn_server.store.stored_columns import epoch_to_column
 from cairn_server.store.tiles import tile_of
 
 
@@ -38,8 +39,8 @@ def append_commit(connection: apsw.Connection, row: MapRow, commit: NewCommit, *
     charged = take_sums(connection, row, commit)
     connection.execute(
         "INSERT INTO commits (map, robot, incarnation, n, sha, size_bytes, cells, meta, captured_first_s,"
-        " captured_last_s, retracts, received_s, received_age_s, rig, signatures, via, charged, bricks)"
-        " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+        " captured_last_s, retracts, received_s, received_age_s, rig, signatures, via, charged, bricks, epoch)"
+        " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
         (
             *key,
             commit.sha,
@@ -55,6 +56,7 @@ def append_commit(connection: apsw.Connection, row: MapRow, commit: NewCommit, *
             commit.via,
             charged,
             commit.bricks,
+            epoch_to_column(commit.epoch),
         ),
     )
     _insert_diff(connection, connection.last_insert_rowid(), commit)
@@ -114,17 +116,18 @@ def write_fold(connection: apsw.Connection, row: MapRow, fold: Fold, *, age_s: f
 
 def _write_cells(connection: apsw.Connection, row: MapRow, fold: Fold) -> None:
     query = (
-        "INSERT INTO cell (map, cell, lm, digest, fingerprint, voxels, size_bytes, hottest_k, body, stamps)"
-        " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)"
+        "INSERT INTO cell (map, cell, lm, digest, fingerprint, voxels, size_bytes, hottest_k, history_bytes, body,"
+        " stamps) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)"
         " ON CONFLICT (map, cell) DO UPDATE SET lm = excluded.lm, digest = excluded.digest,"
         " fingerprint = excluded.fingerprint, voxels = excluded.voxels, size_bytes = excluded.size_bytes,"
-        " hottest_k = excluded.hottest_k, body = excluded.body, stamps = excluded.stamps"
+        " hottest_k = excluded.hottest_k, history_bytes = excluded.history_bytes, body = excluded.body,"
+        " stamps = excluded.stamps"
     )
     tiles = TileWriter(connection, row.number)
     for c in fold.cells:
         tiles.note(c)
-        values = (c.key, c.lm, c.digest, c.fingerprint.to_bytes(), c.voxels, c.size_bytes, c.hottest_k)
-        connection.execute(query, (row.number, *values, c.body, c.stamps))
+        facts = (c.key, c.lm, c.digest, c.fingerprint.to_bytes(), c.voxels, c.size_bytes, c.hottest_k, c.history_bytes)
+        connection.execute(query, (row.number, *facts, c.body, c.stamps))
     tiles.write(folded=sum(entry.kind == ENTRY_FOLD for entry in fold.entries))
 
 
@@ -134,11 +137,11 @@ def heal_cell(connection: apsw.Connection, row: MapRow, cell: CellRow) -> bool:
     if not first(connection, query, (row.number, cell.key, cell.lm)):
         return False
     connection.execute(
-        "UPDATE cell SET digest = ?, fingerprint = ?, voxels = ?, size_bytes = ?, body = ?, hottest_k = ?"
-        " WHERE map = ? AND cell = ?",
+        "UPDATE cell SET digest = ?, fingerprint = ?, voxels = ?, size_bytes = ?, body = ?, hottest_k = ?,"
+        " history_bytes = ? WHERE map = ? AND cell = ?",
         (
             *(cell.digest, cell.fingerprint.to_bytes(), cell.voxels, cell.size_bytes, cell.body, cell.hottest_k),
-            *(row.number, cell.key),
+            *(cell.history_bytes, row.number, cell.key),
         ),
     )
     recount_tile(connection, row.number, tile_of(cell.key))

@@ -16,7 +16,7 @@ from cairn_server.store.sqlite.schema import WAITING, WAITING_MAPS
 from cairn_server.store.sqlite.snapshot import SqliteSnapshot
 from cairn_server.store.sqlite.writer import Values, first, rows
 from cairn_server.store.store_rows import MapRow, StoredCommit
-from cairn_server.store.stored_columns import ids_from_text
+from cairn_server.store.stored_columns import epoch_from_column, ids_from_text
 
 
 class SqliteReads:
@@ -107,14 +107,15 @@ class SqliteReads:
         known = self._maps.get(number)
         # In a store that was restored the number may be another map's.
         if known is None or known.seal_key != seal_key:
-            query = "SELECT name, geometry, sensor_model FROM map WHERE number = ?"
-            name, geometry, sensor_model = first(reader, query, (number,))
+            query = "SELECT name, geometry, sensor_model, epoch_s FROM map WHERE number = ?"
+            name, geometry, sensor_model, epoch_s = first(reader, query, (number,))
             known = self._maps[number] = MapRow(
                 number=number,
                 name=name,
                 geometry=Geometry.model_validate_json(geometry),
                 sensor_model=SensorModel.model_validate_json(sensor_model),
                 seal_key=seal_key,
+                epoch_s=epoch_s,
             )
         return known
 
@@ -124,12 +125,12 @@ class SqliteReads:
 
     def _commits(self, clause: str, values: Values, *, size_bytes_max: int) -> list[StoredCommit]:
         """Commits in the order asked for, as long as their bytes stay within the size; the first in any case."""
-        columns = "number, robot, incarnation, n, sha, meta, retracts, gone, due_from, size_bytes, signatures"
+        columns = "number, robot, incarnation, n, sha, meta, retracts, gone, due_from, size_bytes, signatures, epoch"
         found: list[StoredCommit] = []
         total_bytes = 0
         with self._readers.transaction() as reader:
             query = f"SELECT {columns} FROM commits WHERE {clause}"  # noqa: S608 - our own clause
-            for number, *author, n, sha, text, retracts, gone, due_from, size_bytes, signed in reader.execute(
+            for number, *author, n, sha, text, retracts, gone, due_from, size_bytes, signed, epoch in reader.execute(
                 query, values
             ):
                 total_bytes += size_bytes
@@ -147,6 +148,7 @@ class SqliteReads:
                         gone=bool(gone),
                         signatures=signed,
                         due_from=due_from,
+                        epoch=epoch_from_column(epoch),
                     )
                 )
         return found

@@ -293,6 +293,17 @@ DROP INDEX commits_folded;
 CREATE INDEX commits_folded ON commits (map, folded_age_s, folded_seq) WHERE folded_seq IS NOT NULL;
 """
 
+EPOCHS = """
+ALTER TABLE map ADD COLUMN epoch_s INTEGER;         -- length of an epoch; NULL: one sum for all times
+ALTER TABLE map ADD COLUMN history_bytes INTEGER NOT NULL DEFAULT 0;    -- of cells_bytes: rows older than their newest
+ALTER TABLE commits ADD COLUMN epoch INTEGER;       -- of its evidence; NULL: the base
+ALTER TABLE cell ADD COLUMN history_bytes INTEGER NOT NULL DEFAULT 0;   -- these two of size_bytes
+ALTER TABLE tile ADD COLUMN history_bytes INTEGER NOT NULL DEFAULT 0;
+DROP INDEX cell_listed;
+CREATE INDEX cell_listed
+    ON cell (map, cell, lm, digest, fingerprint, voxels, size_bytes, gone_seq, hottest_k, history_bytes);
+"""
+
 STEPS = (
     FIRST,
     STAMPS,
@@ -309,6 +320,7 @@ STEPS = (
     CAPTURED,
     DUE,
     TILES,
+    EPOCHS,
 )
 
 
@@ -330,7 +342,7 @@ def ensure_schema(connection: apsw.Connection) -> None:
     connection.execute("BEGIN IMMEDIATE")
     for step in STEPS[version:]:
         connection.execute(step)
-        if step is TILES:
-            fill_tiles(connection)
+    if TILES in STEPS[version:]:
+        fill_tiles(connection)
     connection.execute(f"PRAGMA user_version = {len(STEPS)}")
     connection.execute("COMMIT")

@@ -27,7 +27,7 @@ from cairn_server.store.store_rows import (
     Selection,
     Totals,
 )
-from cairn_server.store.stored_columns import cell_row, log_entry
+from cairn_server.store.stored_columns import cell_row, epoch_from_column, log_entry
 from cairn_server.store.tiles import Box, is_in_box
 
 PARENT, SEEN, PLACE, NOTE = (
@@ -114,7 +114,7 @@ class SqliteSnapshot:
         """Entries after `after_seq` that touch a cell, oldest first, at most so many of the newest."""
         found = rows(
             self._connection,
-            "SELECT touched.seq, log.kind, robot, incarnation, n, length(diff.body) FROM touched"
+            "SELECT touched.seq, log.kind, robot, incarnation, n, length(diff.body), epoch FROM touched"
             " JOIN log ON log.map = touched.map AND log.seq = touched.seq"
             " JOIN commits ON commits.number = log.commit_number"
             " JOIN diff ON diff.commit_number = commits.number AND diff.cell = touched.cell"
@@ -122,8 +122,8 @@ class SqliteSnapshot:
             (self._map, key, after_seq, -1 if newest is None else newest),
         )
         return [
-            Contribution(seq, kind, CommitId(Author(robot, incarnation), n), size_bytes)
-            for seq, kind, robot, incarnation, n, size_bytes in reversed(found)
+            Contribution(seq, kind, CommitId(Author(robot, incarnation), n), size_bytes, epoch_from_column(epoch))
+            for seq, kind, robot, incarnation, n, size_bytes, epoch in reversed(found)
         ]
 
     def named(self, commits: Sequence[CommitId]) -> list[NamedCommit]:
@@ -266,7 +266,12 @@ class SqliteSnapshot:
         )
         commits, branches = first(self._connection, query, (self._map,))
         return Totals(
-            cells=sums.cells, size_bytes=sums.size_bytes, commits=commits, branches=branches, corner_cells=corners
+            cells=sums.cells,
+            size_bytes=sums.size_bytes,
+            commits=commits,
+            branches=branches,
+            corner_cells=corners,
+            history_bytes=sums.history_bytes,
         )
 
 

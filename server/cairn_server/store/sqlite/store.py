@@ -15,6 +15,7 @@ import apsw
 
 from cairn_map.commits.cursor import Cursor, first_chain
 from cairn_map.commits.ids import Author, Incarnation, RobotName, new_incarnation
+from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import BadInputError, NotFoundError, UnreachableError
 from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
@@ -106,20 +107,23 @@ class SqliteStore(SqliteReads):
         self._names: dict[str, MapRow] = {}  # of maps, which never change
         self.notes = SqliteBranchNotes(self._writer, self._readers)
 
-    def create_map(self, name: str, geometry: Geometry, sensor_model: SensorModel) -> tuple[MapRow, bool]:
+    def create_map(
+        self, name: str, geometry: Geometry, sensor_model: SensorModel, epoch_s: int | None = None
+    ) -> tuple[MapRow, bool]:
         """The map and whether it is new; an equal one may exist already."""
+        layer = MapLayer(geometry=geometry, epoch_s=epoch_s)
 
         def job(connection: apsw.Connection) -> bool:
-            found = first(connection, "SELECT geometry, sensor_model FROM map WHERE name = ?", (name,))
+            found = first(connection, "SELECT geometry, epoch_s, sensor_model FROM map WHERE name = ?", (name,))
             if found:
-                known = Geometry.model_validate_json(found[0]), SensorModel.model_validate_json(found[1])
-                check_same_map(name, known, (geometry, sensor_model))
+                known = MapLayer(geometry=Geometry.model_validate_json(found[0]), epoch_s=found[1])
+                check_same_map(name, (known, SensorModel.model_validate_json(found[2])), (layer, sensor_model))
                 return False
             log_id = secrets.token_bytes(16)
             tops = [0] * (2 + geometry.plane_count)
             connection.execute(
-                "INSERT INTO map (name, geometry, sensor_model, operator, log_id, seq, chain, tops, seal_key)"
-                " VALUES (?, ?, ?, ?, ?, 0, ?, ?, randomblob(32))",
+                "INSERT INTO map (name, geometry, sensor_model, operator, log_id, seq, chain, tops, epoch_s, seal_key)"
+                " VALUES (?, ?, ?, ?, ?, 0, ?, ?, ?, randomblob(32))",
                 (
                     name,
                     geometry.model_dump_json(),
@@ -128,6 +132,7 @@ class SqliteStore(SqliteReads):
                     log_id,
                     first_chain(log_id, geometry.digest()),
                     json.dumps(tops),
+                    layer.epoch_s,
                 ),
             )
             return True
@@ -330,6 +335,9 @@ class SqliteHealth:
 
     def figures(self) -> StoreFigures:
         """Sizes and counts."""
+        with self._readers.reading() as reader:
+            sums = "SELECT coalesce(sum(cells_bytes), 0), coalesce(sum(history_bytes), 0) FROM map"
+            cells_bytes, history_bytes = first(reader, sums)
         return StoreFigures(
             size_bytes=self._path.stat().st_size,
             ahead_bytes=self._writer.checkpoints.size_bytes(),
@@ -338,6 +346,8 @@ class SqliteHealth:
             written=self._writer.written,
             emptied=self._writer.checkpoints.count,
             failures=dict(self._writer.failures),
+            cells_bytes=cells_bytes,
+            history_bytes=history_bytes,
         )
 
     def check_space(self, free_bytes_min: int) -> None:

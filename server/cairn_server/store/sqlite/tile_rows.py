@@ -28,7 +28,9 @@ from cairn_server.store.tiles import (
     touches_box,
 )
 
-CELL_COLUMNS = "cell, lm, digest, fingerprint, voxels, size_bytes, gone_seq, hottest_k"
+CELL_COLUMNS = "cell, lm, digest, fingerprint, voxels, size_bytes, gone_seq, hottest_k, history_bytes"
+SUM_COLUMNS = "lm, voxels > 0, size_bytes, fingerprint, history_bytes"
+"""SQL of what a tile counts of a cell (`_sums_of`)."""
 IN_TILES = (
     # CROSS JOIN keeps the order: a range of the index over listed cells for each tile.
     f"json_each(?) AS tile CROSS JOIN cell INDEXED BY cell_listed ON cell.map = ?"
@@ -39,10 +41,10 @@ IN_TILES = (
 
 def totals_of(connection: apsw.Connection, map_number: int) -> tuple[TileSums, Corners | None]:
     """Sums over all cells of a map, and the corners of those with a voxel."""
-    query = "SELECT cells, cells_bytes, fingerprint, corners FROM map WHERE number = ?"
-    cells, size_bytes, fingerprint, corners = first(connection, query, (map_number,))
-    sums = TileSums(0, cells, size_bytes, fingerprint_from_bytes(fingerprint) if fingerprint else ZERO)
-    return sums, _corners_from_text(corners)
+    query = "SELECT cells, cells_bytes, fingerprint, history_bytes, corners FROM map WHERE number = ?"
+    cells, size_bytes, fingerprint, history_bytes, corners = first(connection, query, (map_number,))
+    found = fingerprint_from_bytes(fingerprint) if fingerprint else ZERO
+    return TileSums(0, cells, size_bytes, found, history_bytes), _corners_from_text(corners)
 
 
 def tiles_changed(connection: apsw.Connection, map_number: int, *, after_seq: int, box: Box | None) -> list[int]:
@@ -81,11 +83,12 @@ class TileWriter:
 
     def note(self, after: CellRow) -> None:
         """Count a cell that is about to be written."""
-        query = "SELECT fingerprint, voxels, size_bytes FROM cell INDEXED BY cell_listed WHERE map = ? AND cell = ?"
+        columns = "fingerprint, voxels, size_bytes, history_bytes"
+        query = f"SELECT {columns} FROM cell INDEXED BY cell_listed WHERE map = ? AND cell = ?"  # noqa: S608 - constant
         found = first(self._connection, query, (self._map, after.key))
         before = None
         if found:
-            fingerprint, voxels, size_bytes = found
+            fingerprint, voxels, size_bytes, history_bytes = found
             before = CellRow(
                 key=after.key,
                 lm=0,
@@ -94,6 +97,7 @@ class TileWriter:
                 voxels=voxels,
                 body=b"",
                 size_bytes=size_bytes,
+                history_bytes=history_bytes,
             )
         self._changes.add(before, after)
 
@@ -117,7 +121,7 @@ class TileWriter:
 def recount_tile(connection: apsw.Connection, map_number: int, tile: int) -> None:
     """Compute a tile's sums again from its cells: the row of a damaged cell does not say what it was counted as."""
     before = _tiles(connection, map_number, [tile]).get(tile, TileSums())
-    query = f"SELECT lm, voxels > 0, size_bytes, fingerprint FROM {IN_TILES}"  # noqa: S608 - our own clause
+    query = f"SELECT {SUM_COLUMNS} FROM {IN_TILES}"  # noqa: S608 - our own clause
     found = rows(connection, query, (json.dumps([tile]), map_number))
     after = sum((_sums_of(*cell) for cell in found), TileSums())
     _put_tiles(connection, map_number, [(tile, after)])
@@ -137,7 +141,7 @@ def fill_tiles(connection: apsw.Connection) -> None:
     connection.execute("DELETE FROM tile; DELETE FROM vector_mark")
     for (number,) in rows(connection, "SELECT number FROM map"):
         sums: dict[int, TileSums] = {}
-        query = f"SELECT cell >> {TILE_BITS}, lm, voxels > 0, size_bytes, fingerprint FROM cell WHERE map = ?"  # noqa: S608
+        query = f"SELECT cell >> {TILE_BITS}, {SUM_COLUMNS} FROM cell WHERE map = ?"  # noqa: S608
         for tile, *cell in connection.execute(query, (number,)):
             sums[tile] = sums.get(tile, TileSums()) + _sums_of(*cell)
         _put_tiles(connection, number, sums.items())
@@ -160,35 +164,40 @@ def _fill_marks(connection: apsw.Connection, map_number: int) -> None:
 
 def _tiles(connection: apsw.Connection, map_number: int, tiles: Iterable[int]) -> dict[int, TileSums]:
     query = (
-        "SELECT tile, lm, cells, size_bytes, fingerprint FROM tile"
+        "SELECT tile, lm, cells, size_bytes, fingerprint, history_bytes FROM tile"
         " WHERE map = ? AND tile IN (SELECT value FROM json_each(?))"
     )
     found = rows(connection, query, (map_number, json.dumps(sorted(tiles))))
     return {
-        tile: TileSums(lm, cells, size_bytes, fingerprint_from_bytes(fingerprint))
-        for tile, lm, cells, size_bytes, fingerprint in found
+        tile: TileSums(lm, cells, size_bytes, fingerprint_from_bytes(fingerprint), history_bytes)
+        for tile, lm, cells, size_bytes, fingerprint, history_bytes in found
     }
 
 
-def _sums_of(lm: int, is_known: int, size_bytes: int, fingerprint: bytes) -> TileSums:
+def _sums_of(lm: int, is_known: int, size_bytes: int, fingerprint: bytes, history_bytes: int) -> TileSums:
     """Sums of a tile of one cell."""
-    return TileSums(lm, is_known, size_bytes * is_known, fingerprint_from_bytes(fingerprint))
+    found = fingerprint_from_bytes(fingerprint)
+    return TileSums(lm, is_known, size_bytes * is_known, found, history_bytes * is_known)
 
 
 def _put_tiles(connection: apsw.Connection, map_number: int, sums: Iterable[tuple[int, TileSums]]) -> None:
     connection.executemany(
-        "INSERT INTO tile (map, tile, lm, cells, size_bytes, fingerprint) VALUES (?, ?, ?, ?, ?, ?)"
+        "INSERT INTO tile (map, tile, lm, cells, size_bytes, fingerprint, history_bytes) VALUES (?, ?, ?, ?, ?, ?, ?)"
         " ON CONFLICT (map, tile) DO UPDATE SET lm = excluded.lm, cells = excluded.cells,"
-        " size_bytes = excluded.size_bytes, fingerprint = excluded.fingerprint",
-        ((map_number, tile, one.lm, one.cells, one.size_bytes, one.fingerprint.to_bytes()) for tile, one in sums),
+        " size_bytes = excluded.size_bytes, fingerprint = excluded.fingerprint,"
+        " history_bytes = excluded.history_bytes",
+        (
+            (map_number, tile, one.lm, one.cells, one.size_bytes, one.fingerprint.to_bytes(), one.history_bytes)
+            for tile, one in sums
+        ),
     )
 
 
 def _put_totals(connection: apsw.Connection, map_number: int, sums: TileSums, corners: Corners | None) -> None:
     text = json.dumps(corners) if corners else None
     connection.execute(
-        "UPDATE map SET cells = ?, cells_bytes = ?, fingerprint = ?, corners = ? WHERE number = ?",
-        (sums.cells, sums.size_bytes, sums.fingerprint.to_bytes(), text, map_number),
+        "UPDATE map SET cells = ?, cells_bytes = ?, fingerprint = ?, history_bytes = ?, corners = ? WHERE number = ?",
+        (sums.cells, sums.size_bytes, sums.fingerprint.to_bytes(), sums.history_bytes, text, map_number),
     )
 
 

@@ -61,6 +61,7 @@ def new_commit(commit: Commit, tops: Mapping[int, tuple[int, ...]], *, bricks: i
         tops=tops,
         bricks=bricks,
         rig=bytes.fromhex(commit.meta.rig) if commit.meta.rig else None,
+        epoch=commit.meta.row,
     )
 
 
