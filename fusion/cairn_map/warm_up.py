@@ -4,16 +4,23 @@ The kernels are run through the public functions, because a kernel is compiled a
 read-only arrays, as decoding gives them, are another type than those that a robot made.
 """
 
+from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 
 import numpy as np
 
 from cairn_map.codec.cell_code import Profile, decode_canonical_cell, encode_cell
 from cairn_map.codec.cell_reading import cell_reader
 from cairn_map.codec.view_code import decode_view, encode_view
+from cairn_map.epochs.cell_history import cell_history
+from cairn_map.epochs.cell_reading import CellReading
+from cairn_map.epochs.epoch import BASE, Epoch
+from cairn_map.epochs.present import present
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.brick_cell import brick_cell
 from cairn_map.evidence.channels import planes_and_squares
+from cairn_map.evidence.compact_cell import HeldCell
 from cairn_map.evidence.evidence import (
     COUNT_MAX,
     SUM_MAX,
@@ -27,6 +34,7 @@ from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.fingerprint import fingerprint
 from cairn_map.evidence.grid import BRICK_DEPTH, CellKey, Geometry, cell_key, voxels_in_cell
 from cairn_map.evidence.inverse_sensor_model import SensorModel
+from cairn_map.queries.frozen_map import FreezableMap
 from cairn_map.queries.map_snapshot import snapshot_of
 from cairn_map.render.camera_rays import look_at, pinhole
 from cairn_map.render.map_picture import layer_picture, layer_values
@@ -57,6 +65,7 @@ def warm_up() -> None:
         every_sum_has_weight(evidence.samples, geometry)
         channel_above(evidence.samples, planes_and_squares(geometry.channels), 1)
         voxels_in_cell(evidence.voxels, key, geometry)
+        present(cell_history({BASE: evidence}), geometry, SensorModel())
     decode_view(encode_view(key, modelled, geometry, SensorModel()))
     for evidence in made:
         reader = cell_reader(encode_cell(key, evidence, geometry).data)
@@ -65,7 +74,11 @@ def warm_up() -> None:
             reader.channel(c)
         reader.bricks(0, 1)
     for evidence in (small, large):
-        _ask(evidence, geometry)
+        whole = EvidenceMap(geometry)
+        whole.replace(key, evidence)
+        _ask(whole)
+    for evidence in (*made, *read):
+        _ask(_OneReading(evidence, geometry))
     warm_up_pictures()
 
 
@@ -95,12 +108,31 @@ def _draw(key: CellKey, cell: ReadCell, geometry: Geometry, model: SensorModel, 
     layer_picture(values, drawing.seen, SCALES[layer], PoseSpread.of_sigmas(0.01, 0.01))
 
 
-def _ask(evidence: Evidence, geometry: Geometry) -> None:
+@dataclass(frozen=True, slots=True)
+class _OneReading:
+    """A map of one cell with two rows of the same evidence, of which the newest grows."""
+
+    evidence: Evidence
+    geometry: Geometry
+
+    def frozen_cells(self, model: SensorModel) -> Mapping[CellKey, HeldCell]:
+        row = brick_cell(self.geometry, [self.evidence])
+        rows = {BASE: row.copy(), Epoch(0): row}
+        reading = CellReading(self.geometry, model, lambda: rows)
+        reading.cell()
+        with suppress(BadInputError):
+            row.merge(self.evidence)
+            reading.note(Epoch(0), self.evidence, 1)
+        return {cell_key((0, 0, 0)): reading.cell()}
+
+    def frozen_times(self) -> None:
+        return None
+
+
+def _ask(whole: FreezableMap) -> None:
     """Every query of a map of one cell."""
-    whole = EvidenceMap(geometry)
-    whole.replace(cell_key((0, 0, 0)), evidence)
     snapshot = snapshot_of(whole)
-    points = np.full((1, 3), geometry.voxel_edge_m / 2)
+    points = np.full((1, 3), snapshot.geometry.voxel_edge_m / 2)
     snapshot.state_at(points)
     snapshot.counts_at(points)
     snapshot.log_odds_at(points)

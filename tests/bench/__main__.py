@@ -32,6 +32,7 @@ from tests.bench.many_maps import many_map_rows
 from tests.bench.overlay import overlay_rows
 from tests.bench.peers import peer_rows
 from tests.bench.queries import query_rows
+from tests.bench.readings import reading_rows
 from tests.bench.scale import scale_rows
 from tests.bench.server import server_rows
 from tests.bench.simulation import simulation_rows
@@ -261,6 +262,7 @@ PARTS: dict[str, Callable[[bool], Iterator[Row]]] = {
     "overlay": overlay_rows,
     "peers": peer_rows,
     "queries": query_rows,
+    "readings": reading_rows,
     "scale": scale_rows,
     "server": server_rows,
     "large-map": large_map_rows,

@@ -2,6 +2,7 @@
 
     map.merge(diff, epoch=e)     add a measurement      map.unmerge(diff, epoch=e)     take it out again, exactly
     map.history(key)             rows of a cell         map.evidence(key)              their sum
+    snapshot_of(map, model)      as it reads now        snapshot_of(MapReading(map, at=e), model)    as it was
 
 A map without epochs has the base alone, and is held as an `EvidenceMap` is.
 """
@@ -12,10 +13,12 @@ from collections.abc import Iterable, Iterator, Mapping
 from cairn_map.epochs.cell_history import CellHistory, cell_history
 from cairn_map.epochs.epoch import BASE, Epoch
 from cairn_map.epochs.layer import MapLayer
-from cairn_map.evidence.compact_cell import CellCoding
+from cairn_map.epochs.map_reading import MapReading
+from cairn_map.evidence.compact_cell import CellCoding, HeldCell, VoxelTimes
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.evidence_map import NO_BODIES, Bodies, Diff, EvidenceMap
 from cairn_map.evidence.grid import CellKey, Geometry
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 
 NO_ROWS: Mapping[Epoch, bytes] = {}
 
@@ -30,6 +33,7 @@ class HistoryMap:
         self._rows: dict[Epoch, EvidenceMap] = {BASE: EvidenceMap(layer.geometry, coding=coding)}
         self._versions: dict[CellKey, int] = {}
         self._version = 0
+        self._reading: MapReading | None = None
 
     def __iter__(self) -> Iterator[CellKey]:
         return iter(sorted(set().union(*self._rows.values())))
@@ -67,6 +71,11 @@ class HistoryMap:
         return sum(row.size_bytes for row in self._rows.values())
 
     @property
+    def reading_bytes(self) -> int:
+        """Memory held by the readings that were made for snapshots, besides the rows."""
+        return self._reading.size_bytes if self._reading else 0
+
+    @property
     def base(self) -> EvidenceMap:
         """Evidence without a time; of a map without epochs, all of it."""
         return self._rows[BASE]
@@ -98,6 +107,8 @@ class HistoryMap:
         """
         self._of(epoch).merge(diff, bodies=bodies)
         self._note(diff)
+        if self._reading is not None:
+            self._reading.note(diff, epoch=epoch, sign=1)
 
     def unmerge(self, diff: Diff, *, epoch: Epoch = BASE) -> None:
         """Take a diff out again; it must have been merged before, else sums become negative.
@@ -107,6 +118,8 @@ class HistoryMap:
         """
         self._of(epoch).unmerge(diff)
         self._note(diff)
+        if self._reading is not None:
+            self._reading.note(diff, epoch=epoch, sign=-1)
 
     def replace(
         self, key: CellKey, history: CellHistory, *, bodies: Mapping[Epoch, bytes] = NO_ROWS, came_bytes: int = 0
@@ -124,6 +137,8 @@ class HistoryMap:
         for epoch, row in history.rows.items():
             self._of(epoch).replace(key, row, body=bodies.get(epoch), came_bytes=came_bytes)
         self._note((key,))
+        if self._reading is not None:
+            self._reading.forget((key,))
 
     def copy(self) -> "HistoryMap":
         """The same rows, unaffected by later merges; cells share their arrays until one of the two is changed."""
@@ -135,6 +150,24 @@ class HistoryMap:
     def version(self, key: CellKey) -> int:
         """Number that is another one after each change of a cell."""
         return self._versions.get(key, 0)
+
+    def frozen_cells(self, model: SensorModel) -> dict[CellKey, HeldCell]:
+        """All cells as they read now, rising in number, unaffected by later changes; sums in a map without epochs."""
+        if not self.layer.has_epochs:
+            return self.base.frozen_cells(model)
+        # Made here and not with the map: a copy needs none, and would be freed late with one, which refers to it.
+        if self._reading is None:
+            self._reading = MapReading(self)
+        return self._reading.frozen_cells(model)
+
+    def frozen_times(self) -> VoxelTimes | None:
+        """Times at which voxels were seen last; None in a map without epochs."""
+        return MapReading(self).frozen_times()
+
+    def rows(self, key: CellKey) -> dict[Epoch, HeldCell]:
+        """Rows of one cell as they are held, to be read."""
+        held = {epoch: row.held(key) for epoch, row in self._rows.items()}
+        return {epoch: row for epoch, row in held.items() if row is not None}
 
     def history(self, key: CellKey) -> CellHistory:
         """Rows of one cell."""
@@ -160,6 +193,7 @@ class HistoryMap:
         keys = list(self)
         self._rows = {BASE: EvidenceMap(self.geometry, coding=self._coding)}
         self._note(keys)
+        self._reading = None
 
     def _of(self, epoch: Epoch) -> EvidenceMap:
         """Map of an epoch's rows; once a newer one begins, the others are held as bytes (rule R5)."""

@@ -8,7 +8,9 @@ does not depend on the order in which the rows came. A history of one row reads 
 Samples are not averaged over all times: the newest row's are shown, and older ones only where they are few and agree.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -18,8 +20,8 @@ from cairn_map.epochs.cell_history import CellHistory
 from cairn_map.epochs.epoch import BASE, Epoch
 from cairn_map.epochs.layer import MapLayer
 from cairn_map.epochs.present_kernels import add_counts_into, join_samples_into
-from cairn_map.evidence.channels import Channel, ChannelKind, planes_and_squares
-from cairn_map.evidence.evidence import Evidence, empty_evidence
+from cairn_map.evidence.channels import ChannelKind, planes_and_squares
+from cairn_map.evidence.evidence import COUNT_MAX, Evidence, empty_evidence
 from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel, log_odds
 
@@ -31,6 +33,9 @@ SAMPLE_SIGMA = {
 }
 """Standard deviation of one sample, in the channel's unit: sRGB steps of a textured surface, kelvin of an uncooled
 camera. 0: unknown, so that only equal means are joined."""
+
+FEW = 256
+"""Share of a cell's voxels, as one of so many, below which sorting them is faster than a table of all."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,6 +69,15 @@ class Present:
         """(V,) True where there are hits or misses."""
         return np.asarray((self.counts != 0).any(axis=1))
 
+    @property
+    def evidence(self) -> Evidence:
+        """The reading as evidence with `odds`, as all queries, views and files read it; counts end at `COUNT_MAX`."""
+        counts = np.minimum(self.counts, COUNT_MAX).astype(np.int32)
+        whole = Evidence(self.voxels, counts, self.sampled, self.samples, self.log_odds)
+        keep = self.known
+        keep[self.sampled] = True
+        return whole if keep.all() else whole.where(keep)
+
 
 def present(history: CellHistory, geometry: Geometry, model: SensorModel, *, at: Epoch | None = None) -> Present:
     """Reading of a cell.
@@ -79,37 +93,111 @@ def present(history: CellHistory, geometry: Geometry, model: SensorModel, *, at:
     """
     read = history if at is None else history.until(at)
     epochs, rows = np.array([*read.rows], np.int64), list(read.rows.values())
-    voxels = np.unique(np.concatenate([row.voxels for row in rows])) if rows else np.empty(0, np.uint32)
     # R1: counts, oldest row first.
-    V, C = len(voxels), len(geometry.channels)
-    odds, counts = np.zeros(V), np.zeros((V, 2), np.int64)
-    newest, free_after = np.full(V, -1, np.int32), np.full(V, -1, np.int32)
-    steps = (log_odds(model.p_hit), log_odds(model.p_miss))
-    bounds = (*steps, log_odds(model.p_min), log_odds(model.p_max), log_odds(model.p_occupied))
-    for number, row in enumerate(rows):
-        add_counts_into(voxels, row.voxels, row.counts, number, bounds, odds, counts, newest, free_after)
+    voxels = voxels_of_rows(rows, geometry)
+    read_counts = counts_of_rows(voxels, rows, model)
     # R4: samples, newest row first.
-    samples = np.zeros((V, geometry.plane_count), np.int64)
-    sampled_in, done = np.full((V, C), -1, np.int32), np.zeros((V, C), np.bool_)
-    spec, sigma = planes_and_squares(geometry.channels), _sigmas(geometry.channels)
+    shown = ShownSamples(len(voxels), geometry)
     for number, row in reversed(list(enumerate(rows))):
-        at_voxels = row.voxels[row.sampled]
-        join_samples_into(voxels, at_voxels, row.samples, number, spec, sigma, free_after, samples, sampled_in, done)
-    sampled = np.nonzero((samples != 0).any(axis=1))[0]
+        shown.join(voxels, row.voxels[row.sampled], row.samples, number, read_counts.free_after)
+    sampled = np.nonzero((shown.samples != 0).any(axis=1))[0]
     return Present(
         voxels=voxels,
-        log_odds=odds,
-        counts=counts,
-        newest=_epochs_of(newest, epochs),
+        log_odds=read_counts.odds,
+        counts=read_counts.counts,
+        newest=_epochs_of(read_counts.newest, epochs),
         sampled=sampled.astype(np.uint32),
-        samples=samples[sampled],
-        sampled_in=_epochs_of(sampled_in[sampled], epochs),
+        samples=shown.samples[sampled],
+        sampled_in=_epochs_of(shown.newest[sampled], epochs),
     )
 
 
-def _sigmas(channels: tuple[Channel, ...]) -> Floats:
-    """(C,) standard deviation of one sample of each channel, in its steps."""
-    return np.array([SAMPLE_SIGMA[channel.kind] / channel.step for channel in channels], np.float64)
+class ReadCounts(NamedTuple):
+    """Counts of V voxels, read row by row."""
+
+    odds: Floats
+    """(V,) clamped log-odds."""
+    counts: npt.NDArray[np.int64]
+    """(V, 2) sums of hits and misses."""
+    newest: npt.NDArray[np.int32]
+    """(V,) number of the newest row with counts; -1: none."""
+    free_after: npt.NDArray[np.int32]
+    """(V,) number of the newest row after which the voxel read free; -1: none."""
+
+    def add(self, voxels: npt.NDArray[np.uint32], row: Evidence, number: int, model: SensorModel) -> None:
+        """Read one more row, newer than those before; its voxels are among these (V,)."""
+        steps = log_odds(model.p_hit), log_odds(model.p_miss)
+        bounds = (*steps, log_odds(model.p_min), log_odds(model.p_max), log_odds(model.p_occupied))
+        add_counts_into(voxels, row.voxels, row.counts, number, bounds, *self)
+
+
+def counts_of_rows(voxels: npt.NDArray[np.uint32], rows: Sequence[Evidence], model: SensorModel) -> ReadCounts:
+    """Counts of rows, the oldest first, at (V,) voxels, among which are all of the rows."""
+    V = len(voxels)
+    found = ReadCounts(np.zeros(V), np.zeros((V, 2), np.int64), np.full(V, -1, np.int32), np.full(V, -1, np.int32))
+    for number, row in enumerate(rows):
+        found.add(voxels, row, number, model)
+    return found
+
+
+class ShownSamples:
+    """Samples of V voxels that rule R4 shows."""
+
+    __slots__ = ("_done", "_sigma", "_spec", "newest", "samples")
+
+    def __init__(self, voxels: int, geometry: Geometry) -> None:
+        channels = geometry.channels
+        self._spec = planes_and_squares(channels)
+        self._sigma = np.array([SAMPLE_SIGMA[channel.kind] / channel.step for channel in channels], np.float64)
+        self._done = np.zeros((voxels, len(channels)), np.bool_)
+        self.samples = np.zeros((voxels, geometry.plane_count), np.int64)
+        """(V, P) sums."""
+        self.newest = np.full((voxels, len(channels)), -1, np.int32)
+        """(V, C) number of the newest row of which samples are shown; -1: none."""
+
+    def join(
+        self,
+        voxels: npt.NDArray[np.uint32],
+        row_voxels: npt.NDArray[np.uint32],
+        row_samples: npt.NDArray[np.int64],
+        number: int,
+        free_after: npt.NDArray[np.int32],
+    ) -> None:
+        """Join one more row, older than those before, if it is to be.
+
+        Args:
+            voxels: (V,) rising.
+            row_voxels: (S,) those of them that have samples in the row.
+            row_samples: (S, P) their sums.
+            number: of the row.
+            free_after: `ReadCounts.free_after`.
+        """
+        join_samples_into(
+            voxels,
+            row_voxels,
+            row_samples,
+            number,
+            self._spec,
+            self._sigma,
+            free_after,
+            self.samples,
+            self.newest,
+            self._done,
+        )
+
+
+def voxels_of_rows(rows: Sequence[Evidence], geometry: Geometry) -> npt.NDArray[np.uint32]:
+    """(V,) voxels of all rows, rising."""
+    if len(rows) == 1:
+        return rows[0].voxels.copy()
+    # A table of all voxels is much faster than sorting, unless they are few.
+    count, top = sum(len(row) for row in rows), 8**geometry.depth
+    if count * FEW < top:
+        return np.unique(np.concatenate([np.empty(0, np.uint32), *(row.voxels for row in rows)]))
+    there = np.zeros(top, np.bool_)
+    for row in rows:
+        there[row.voxels] = True
+    return np.flatnonzero(there).astype(np.uint32)
 
 
 def _epochs_of(numbers: npt.NDArray[np.int32], epochs: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
@@ -128,5 +216,4 @@ def shown_evidence(history: CellHistory, layer: MapLayer, model: SensorModel, *,
     """
     if not layer.has_epochs:
         return history.rows.get(BASE) or empty_evidence(layer.geometry)
-    read = present(history, layer.geometry, model, at=at)
-    return Evidence(read.voxels, read.counts.astype(np.int32), read.sampled, read.samples)
+    return present(history, layer.geometry, model, at=at).evidence

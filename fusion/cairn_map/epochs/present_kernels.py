@@ -1,5 +1,7 @@
 """Kernels that read the rows of a cell: log-odds clamped from epoch to epoch, and the samples that are shown.
 
+`number_words_into` makes log-odds small: a cell has few different ones, because they come from few small counts.
+
 Rows and readings are lists of voxels, both rising, so each kernel walks them together once.
 """
 
@@ -11,6 +13,8 @@ ALONE_MIN = 3
 """Samples from which on the newest row is read alone."""
 JOINED_MIN = 8
 """Samples up to which older rows that agree are joined."""
+GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+"""2^64 over the golden ratio."""
 AGREE_SIGMA = 3.0
 """Standard errors within which two means agree."""
 
@@ -113,3 +117,39 @@ def join_samples_into(
                         samples[at, p] += row_samples[n, p]
                 done[at, c] = not agrees or samples[at, weight] >= (JOINED_MIN if held != 0 else ALONE_MIN)
             first = weight + 1
+
+
+@nb.njit(cache=True, nogil=True)
+def number_words_into(
+    words: npt.NDArray[np.uint64],
+    table: npt.NDArray[np.int32],
+    hash_shift: int,
+    palette: npt.NDArray[np.uint64],
+    codes: npt.NDArray[np.uint16],
+) -> int:
+    """Number equal words alike, in order of appearance from 1 on; 0 stays free.
+
+    Args:
+        words: (N,) any.
+        table: (H,) a hash table of numbers, zeros, a power of two and longer than the palette.
+        hash_shift: 64 less the bits of H.
+        palette: (K,) word of each number, changed.
+        codes: (N,) the numbers, changed.
+
+    Returns:
+        One beyond the last number; -1 if there are more words than the palette takes.
+    """
+    count = 1
+    for n in range(len(words)):
+        # Linear probing from the hash on (Fibonacci hashing), to the word or to a free place.
+        at = (words[n] * GOLDEN) >> np.uint64(hash_shift)
+        while table[at] != 0 and palette[table[at]] != words[n]:
+            at = (at + np.uint64(1)) & np.uint64(len(table) - 1)
+        if table[at] == 0:
+            if count == len(palette):
+                return -1
+            table[at] = count
+            palette[count] = words[n]
+            count += 1
+        codes[n] = table[at]
+    return count

@@ -24,12 +24,12 @@ def blocks_of(evidence: Evidence) -> Blocks:
 
 def of_blocks(evidence: Evidence, blocks: Blocks) -> Evidence:
     """Packed evidence of the voxels in some blocks."""
-    return _rows(evidence, _in_blocks(evidence, blocks))
+    return evidence.where(_in_blocks(evidence, blocks))
 
 
 def without_blocks(evidence: Evidence, blocks: Blocks) -> Evidence:
     """Packed evidence of the voxels outside of some blocks."""
-    return _rows(evidence, ~_in_blocks(evidence, blocks))
+    return evidence.where(~_in_blocks(evidence, blocks))
 
 
 def _in_blocks(evidence: Evidence, blocks: Blocks) -> npt.NDArray[np.bool_]:
@@ -40,14 +40,3 @@ def _in_blocks(evidence: Evidence, blocks: Blocks) -> npt.NDArray[np.bool_]:
     chosen = np.zeros(count, np.bool_)
     chosen[blocks] = True
     return np.asarray(chosen[evidence.voxels >> np.uint32(BLOCK_BITS)])
-
-
-def _rows(evidence: Evidence, keep: npt.NDArray[np.bool_]) -> Evidence:
-    kept_rows = keep[evidence.sampled]
-    new_row = np.cumsum(keep) - 1
-    return Evidence(
-        evidence.voxels[keep],
-        evidence.counts[keep],
-        new_row[evidence.sampled[kept_rows]].astype(np.uint32),
-        evidence.samples[kept_rows],
-    )

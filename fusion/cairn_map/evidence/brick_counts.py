@@ -57,6 +57,14 @@ class BrickCounts:
         kernels.pack_into(self._brick_of, self._pool, sampled, *out)
         return out
 
+    def of_voxels(self, voxels: Voxels) -> Int32s:
+        """(V, 2) counts of some voxels."""
+        bricks = self._brick_of[voxels >> np.uint32(9)]
+        counts = np.zeros((len(voxels), 2), np.int32)
+        there = bricks >= 0
+        counts[there] = self._pool[bricks[there], voxels[there] & np.uint32(511)]
+        return counts
+
     def copy(self) -> "BrickCounts":
         """The same sums in arrays of its own."""
         copied = BrickCounts.__new__(BrickCounts)

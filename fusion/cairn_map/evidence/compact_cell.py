@@ -7,7 +7,12 @@ beams cross a cell once, it is up to 740 times; such cells are small.
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
+import numpy as np
+import numpy.typing as npt
+
+from cairn_map.arrays import Floats
 from cairn_map.evidence.brick_cell import BrickCell, brick_cell
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey, Geometry
@@ -47,12 +52,34 @@ class CompactCell:
         return len(self.data)
 
 
-HeldCell = BrickCell | CompactCell
-"""A cell of a map in memory: its sums, or the bytes that stand for them."""
+class ClosedCell(Protocol):
+    """A cell that is immutable and made into bricks wherever it is read: `CompactCell`, or a reading of such."""
+
+    def opened(self) -> BrickCell:
+        """The cell's bricks, in arrays of the caller's own."""
+        ...
+
+    def packed(self) -> Evidence:
+        """The canonical packed evidence."""
+        ...
+
+    @property
+    def size_bytes(self) -> int:
+        """Memory held."""
+        ...
+
+
+HeldCell = BrickCell | ClosedCell
+"""A cell of a map in memory: its sums or a reading of them, or that of which these are made."""
+
+
+VoxelTimes = Callable[[CellKey, npt.NDArray[np.uint32]], Floats]
+"""Times at which voxels of a cell were seen last: (N,) UTC seconds since 1970 of (N,) Morton codes inside it; NaN where
+nothing was seen, or nothing that has a time."""
 
 
 def opened(cell: HeldCell) -> BrickCell:
-    """The sums of a cell, to be read: its own, or made of its bytes."""
+    """The bricks of a cell, to be read: its own, or made of its bytes."""
     return cell if isinstance(cell, BrickCell) else cell.opened()
 
 
@@ -63,4 +90,4 @@ def has_sums(cell: HeldCell, sums: tuple[object, ...]) -> bool:
 
 def sums_of(cell: HeldCell) -> tuple[object, ...]:
     """Objects that stay the same as long as a frozen cell's sums do."""
-    return (cell.counts, cell.samples) if isinstance(cell, BrickCell) else (cell,)
+    return (cell.counts, cell.samples, cell.odds) if isinstance(cell, BrickCell) else (cell,)

@@ -4,10 +4,11 @@
     counts   (V, 2) int32   hits, misses
     sampled  (S,)   uint32  rows of `voxels` that have samples, rising
     samples  (S, P) int64   sums, in the order of `Geometry.channels` and their planes
+    odds     (V,)   float64 log-odds, if it is a reading of evidence by epoch; None: they follow from the counts
 
 Packed evidence is canonical: a voxel is there if and only if one of its numbers is not zero. Evidence
 that robots make is never negative; only the difference between two states of a map may be.
-`brick_cell.BrickCell` is the form that adds quickly.
+`brick_cell.BrickCell` is the form that adds quickly. A reading is read as sums are, but never added.
 """
 
 from dataclasses import dataclass
@@ -15,23 +16,29 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.channels import planes_and_squares
 from cairn_map.evidence.evidence_kernels import bounds_of_counts, largest_into, sums_without_weight
 from cairn_map.evidence.grid import BRICK_DEPTH, Geometry
+from cairn_map.evidence.inverse_sensor_model import SensorModel, known, log_odds
 
+Rows = slice | npt.NDArray[np.integer] | npt.NDArray[np.bool_]
+EVERY_ROW = slice(None)
 COUNT_MAX = (1 << 31) - 1
 SUM_MAX = 1 << 62
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evidence:
-    """Packed evidence of one cell; equal if all four arrays are."""
+    """Packed evidence of one cell; equal if all arrays are."""
 
     voxels: npt.NDArray[np.uint32]
     counts: npt.NDArray[np.int32]
     sampled: npt.NDArray[np.uint32]
     samples: npt.NDArray[np.int64]
+    odds: Floats | None = None
+    """(V,) log-odds clamped from epoch to epoch under one sensor model (rule R1), 0 where unknown; None: of sums."""
 
     def __post_init__(self) -> None:
         V, S = self.voxels.shape[:1], self.sampled.shape[:1]
@@ -40,6 +47,8 @@ class Evidence:
         shapes_fit = self.counts.shape == (*V, 2) and self.samples.shape[:-1] == S and len(V) == len(S) == 1
         if not shapes_fit or dtypes != [np.uint32, np.int32, np.uint32, np.int64]:
             raise BadInputError("bad_evidence", f"arrays do not fit: {[(a.dtype.name, a.shape) for a in arrays]}")
+        if self.odds is not None and (self.odds.shape != V or self.odds.dtype != np.float64):
+            raise BadInputError("bad_evidence", f"odds must be float64 {V}, got {self.odds.dtype} {self.odds.shape}")
 
     def __hash__(self) -> int:
         return hash((len(self.voxels), len(self.sampled)))
@@ -51,6 +60,8 @@ class Evidence:
             and np.array_equal(self.counts, other.counts)
             and np.array_equal(self.sampled, other.sampled)
             and np.array_equal(self.samples, other.samples)
+            and (self.odds is None) == (other.odds is None)
+            and (self.odds is None or other.odds is None or np.array_equal(self.odds, other.odds))
         )
 
     def __len__(self) -> int:
@@ -59,7 +70,8 @@ class Evidence:
     @property
     def size_bytes(self) -> int:
         """Memory held by the arrays."""
-        return self.voxels.nbytes + self.counts.nbytes + self.sampled.nbytes + self.samples.nbytes
+        odds = 0 if self.odds is None else self.odds.nbytes
+        return self.voxels.nbytes + self.counts.nbytes + self.sampled.nbytes + self.samples.nbytes + odds
 
     @property
     def brick_count(self) -> int:
@@ -71,6 +83,34 @@ class Evidence:
     def is_signed(self) -> bool:
         """True if any number is negative, which happens only in differences."""
         return bool((self.counts < 0).any() or (self.samples < 0).any())
+
+    def log_odds(self, model: SensorModel, *, rows: Rows = EVERY_ROW) -> Floats:
+        """(N,) clamped log-odds of the voxels in these rows; 0 for unknown ones too.
+
+        A reading has log-odds of its own, under the model that it was made with, which `model` must be.
+        """
+        return model.log_odds(self.counts[rows]) if self.odds is None else self.odds[rows]
+
+    def probability(self, model: SensorModel, *, rows: Rows = EVERY_ROW) -> Floats:
+        """(N,) probability of occupancy of the voxels in these rows; NaN where unknown."""
+        p = 1 / (1 + np.exp(-self.log_odds(model, rows=rows)))
+        return np.where(known(self.counts[rows]), p, np.nan)
+
+    def occupied(self, model: SensorModel) -> npt.NDArray[np.bool_]:
+        """(V,) True where the probability is above `p_occupied`; False for unknown voxels."""
+        return known(self.counts) & (self.log_odds(model) > log_odds(model.p_occupied))
+
+    def where(self, keep: npt.NDArray[np.bool_]) -> "Evidence":
+        """Packed evidence of the voxels where (V,) `keep` is True."""
+        kept = keep[self.sampled]
+        new_row = np.cumsum(keep, dtype=np.int64) - 1
+        return Evidence(
+            self.voxels[keep],
+            self.counts[keep],
+            new_row[self.sampled[kept]].astype(np.uint32),
+            self.samples[kept],
+            None if self.odds is None else self.odds[keep],
+        )
 
 
 def empty_evidence(geometry: Geometry) -> Evidence:
@@ -132,12 +172,16 @@ def largest(counts: npt.NDArray[np.int32], samples: npt.NDArray[np.int64]) -> np
 
 
 def check_fits(evidence: Evidence, geometry: Geometry) -> None:
-    """Refuse evidence that is not packed, or of another geometry: kernels check nothing, and would write out of bounds.
+    """Refuse what is no packed sum of a geometry: kernels check nothing, and would write out of bounds.
 
     Raises:
         BadInputError: kind `bad_evidence`: voxels or sampled rows that do not rise, a voxel outside the cell, a sampled
-            row that is not there, or other planes.
+            row that is not there, other planes, or a reading.
     """
+    if evidence.odds is not None:
+        raise BadInputError(
+            "bad_evidence", "expected sums of evidence, got a reading, which cannot be added or encoded"
+        )
     unsorted = not (_rise(evidence.voxels) and _rise(evidence.sampled))
     outside = len(evidence) > 0 and int(evidence.voxels[-1]) >= 8**geometry.depth
     missing = len(evidence.sampled) > 0 and int(evidence.sampled[-1]) >= len(evidence)

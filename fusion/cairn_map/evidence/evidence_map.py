@@ -16,9 +16,10 @@ import numpy as np
 
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.brick_cell import BrickCell
-from cairn_map.evidence.compact_cell import HELD_PER_BYTE, CellCoding, CompactCell, HeldCell, opened
+from cairn_map.evidence.compact_cell import HELD_PER_BYTE, CellCoding, CompactCell, HeldCell, VoxelTimes, opened
 from cairn_map.evidence.evidence import Evidence, empty_evidence
 from cairn_map.evidence.grid import CellKey, Geometry
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 
 Diff = Mapping[CellKey, Evidence]
 Bodies = Mapping[CellKey, bytes]
@@ -139,6 +140,15 @@ class EvidenceMap:
             copied._cells[key] = entry._replace(cell=cell)
         copied._size_bytes, copied._rests = self._size_bytes, self._rests
         return copied
+
+    def frozen_cells(self, model: SensorModel) -> dict[CellKey, HeldCell]:
+        """All cells, rising in number, unaffected by later merges: sums, which any sensor model may read."""
+        copied = self.copy()
+        return {key: copied._cells[key].cell for key in copied}
+
+    def frozen_times(self) -> VoxelTimes | None:
+        """Times at which voxels were seen: None, because sums have none."""
+        return None
 
     def held(self, key: CellKey) -> HeldCell | None:
         """One cell as it is held, to be read; None if there is none."""

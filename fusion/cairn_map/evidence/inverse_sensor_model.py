@@ -20,6 +20,8 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+LOG_ODDS_STEP = 0.001
+"""Step in which log-odds are rounded where they are kept as 16 bits."""
 Probability = Annotated[float, Field(gt=0, lt=1)]
 
 

@@ -69,6 +69,16 @@ class SampleRows:
         kernels.pack_rows_into(self._known, self._row_of, self._narrow, self._wide_planes, self._wide, *out)
         return out
 
+    def of_voxels(self, voxels: Voxels) -> tuple[npt.NDArray[np.intp], Sums]:
+        """Rows of those of some voxels that have samples, rising, and their sums."""
+        places = np.searchsorted(self._known, voxels)
+        there = places < len(self._known)
+        there[there] = self._known[places[there]] == voxels[there]
+        rows = self._row_of[places[there]]
+        sums = self._narrow[rows].astype(np.int64)
+        sums[:, self._wide_planes] = self._wide[rows]
+        return np.flatnonzero(there), sums
+
     def copy(self) -> "SampleRows":
         """The same sums in arrays of its own."""
         copied = SampleRows.__new__(SampleRows)

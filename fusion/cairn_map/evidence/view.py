@@ -19,9 +19,8 @@ from cairn_map.errors import BadInputError
 from cairn_map.evidence.channels import Channel, ChannelKind
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import Geometry
-from cairn_map.evidence.inverse_sensor_model import SensorModel, log_odds
+from cairn_map.evidence.inverse_sensor_model import LOG_ODDS_STEP, SensorModel, log_odds
 
-LOG_ODDS_STEP = 0.001
 LOG_ODDS_ZERO = 1 << 15
 """Added to log-odds in steps, so that they are 16 bits without a sign."""
 
@@ -153,9 +152,10 @@ def _nodes(evidence: Evidence, model: SensorModel, extent: Extent, *, up: int) -
     """Nodes of the extent, and their highest log-odds; a node's number is a voxel's without its lowest `up` bits."""
     least = log_odds(model.p_occupied) if extent is Extent.OCCUPIED else -np.inf
     hits, misses = evidence.counts.T
-    # Only counts make a voxel known, scalar readings alone do not. A voxel without hits is below one half.
+    # Only counts make a voxel known, scalar readings alone do not. A voxel without hits is not above one half, in a
+    # reading neither: its hits are those of all epochs, and what never rises from 0 never passes it.
     known = np.nonzero(hits != 0 if least >= 0 else (hits | misses) != 0)[0]
-    nodes, odds = evidence.voxels[known], model.log_odds(evidence.counts[known])
+    nodes, odds = evidence.voxels[known], evidence.log_odds(model, rows=known)
     if up and len(nodes):
         # Voxels of one node are one run.
         nodes = nodes >> np.uint32(up)

@@ -69,14 +69,15 @@ def voxels_of_evidence(
     """Voxels of one cell: all with evidence, or only the occupied."""
     samples = np.zeros((len(evidence), geometry.plane_count), np.int64)
     samples[evidence.sampled] = evidence.samples
-    keep = model.occupied(evidence.counts) if occupied_only else np.ones(len(evidence), np.bool_)
+    keep = evidence.occupied(model) if occupied_only else np.ones(len(evidence), np.bool_)
     numbers = voxels_in_cell(evidence.voxels[keep], key, geometry)
     counts = evidence.counts[keep]
     readings = {
         channel.name: reading_of_sums(channel, samples[keep][:, geometry.planes_of(channel.name)])
         for channel in geometry.channels
     }
-    return Voxels(numbers, centres_of_voxels(numbers, geometry), counts, model.probability(counts), readings)
+    probability = evidence.probability(model, rows=keep)
+    return Voxels(numbers, centres_of_voxels(numbers, geometry), counts, probability, readings)
 
 
 def joined_voxels(parts: list[Voxels]) -> Voxels:

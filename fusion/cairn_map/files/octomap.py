@@ -157,7 +157,8 @@ def _blocks(evidence: Evidence, depth: int, down: int) -> Iterator[tuple[int, Ev
         first, last = np.searchsorted(evidence.sampled, np.array([start, end], np.uint32))
         sampled = evidence.sampled[first:last] - np.uint32(start)
         samples = evidence.samples[first:last]
-        yield number, Evidence(evidence.voxels[start:end], evidence.counts[start:end], sampled, samples)
+        odds = None if evidence.odds is None else evidence.odds[start:end]
+        yield number, Evidence(evidence.voxels[start:end], evidence.counts[start:end], sampled, samples, odds)
 
 
 def _half(geometry: Geometry) -> int:

@@ -15,8 +15,8 @@ from cairn_map.arrays import Floats, Ints
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey, Geometry
-from cairn_map.evidence.inverse_sensor_model import SensorModel, known, log_odds
-from cairn_map.evidence.view import LOG_ODDS_STEP, LOG_ODDS_ZERO
+from cairn_map.evidence.inverse_sensor_model import LOG_ODDS_STEP, SensorModel, known, log_odds
+from cairn_map.evidence.view import LOG_ODDS_ZERO
 from cairn_map.files.export_request import SLACK_M, ExportRequest, chosen_in_cell, is_in_box
 from cairn_map.files.octomap_nodes import FREE, LEVELS, OCCUPIED, UNCOLOURED, Codes, Nodes, leaves_of
 from cairn_map.kernels.morton_kernels import deinterleave
@@ -58,7 +58,7 @@ def leaves_in_cell(
 def _free_nodes(evidence: Evidence, model: SensorModel, *, up: int) -> tuple[npt.NDArray[np.uint32], Floats]:
     """Nodes whose voxels are all known and unoccupied, and their highest log-odds."""
     rows = known(evidence.counts)
-    voxels, odds = evidence.voxels[rows], model.log_odds(evidence.counts[rows])
+    voxels, odds = evidence.voxels[rows], evidence.log_odds(model, rows=rows)
     count = np.ones(len(voxels), np.int64)
     nodes = voxels >> np.uint32(up)
     if up and len(nodes):

@@ -2,10 +2,13 @@
 
 Cells share their arrays with the live map, which copies an array before it adds to it. So freezing costs only the
 states of the cells that changed since the last time, and readers need no lock.
+
+Of a map without epochs the cells are its sums; of one with them they are readings, each of one sensor model and time.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -13,8 +16,7 @@ import numpy.typing as npt
 from cairn_map.arrays import Floats, Ints
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.brick_cell import BrickCell
-from cairn_map.evidence.compact_cell import HeldCell, has_sums, opened
-from cairn_map.evidence.evidence_map import EvidenceMap
+from cairn_map.evidence.compact_cell import HeldCell, VoxelTimes, has_sums, opened
 from cairn_map.evidence.grid import CELL_LIMIT, NANOMETRES, CellKey, Geometry, cell_of_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.queries.occupancy_kernels import Grid, brick_corners_into
@@ -22,6 +24,26 @@ from cairn_map.queries.occupancy_states import CellStates, state_grid, states_of
 
 Box = Sequence[Sequence[float]] | npt.NDArray[np.floating]
 """(2, 3) lowest and highest corner, metres, map frame; infinite where a side is open."""
+
+
+class FreezableMap(Protocol):
+    """A map that can be frozen: an `EvidenceMap`, or the reading of a map with epochs at a time."""
+
+    @property
+    def geometry(self) -> Geometry:
+        """Voxel edge, cells and channels."""
+        ...
+
+    def frozen_cells(self, model: SensorModel, /) -> Mapping[CellKey, HeldCell]:
+        """All cells, rising in number, unaffected by later changes of the map; readings are made under this model.
+
+        A cell of which `compact_cell.sums_of` gives the same objects as at the last freeze is not read again.
+        """
+        ...
+
+    def frozen_times(self) -> VoxelTimes | None:
+        """Times at which voxels were seen last, unaffected by later changes of the map; None: it has no epochs."""
+        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,6 +56,8 @@ class FrozenMap:
     cells: tuple[HeldCell, ...]
     states: tuple[CellStates, ...]
     grid: Grid
+    times: VoxelTimes | None = None
+    """Times at which voxels were seen; None: the map has no epochs."""
 
     @property
     def reach_m(self) -> float:
@@ -46,8 +70,8 @@ class FrozenMap:
         # The cells' states are parts of the grid's words; each brick has its number besides.
         return self.grid.bricks.nbytes + self.grid.words.nbytes + 2 * len(self.grid.words)
 
-    def sums(self, slot: int) -> BrickCell:
-        """Sums of the cell in a slot, to be read; of one that is held as bytes, decoded now."""
+    def bricks(self, slot: int) -> BrickCell:
+        """Bricks of the cell in a slot, to be read; of one that is held as bytes, decoded now."""
         return opened(self.cells[slot])
 
     def brick_corners(self) -> Ints:
@@ -76,11 +100,10 @@ class FrozenMap:
         return low, high
 
 
-def freeze(whole: EvidenceMap, model: SensorModel, *, earlier: FrozenMap | None = None) -> FrozenMap:
+def freeze(whole: FreezableMap, model: SensorModel, *, earlier: FrozenMap | None = None) -> FrozenMap:
     """The map as it is now; states of cells that are unchanged since `earlier` are taken from it."""
-    copied = whole.copy()
-    keys = tuple(copied)
-    cells = tuple(cell for key in keys if (cell := copied.held(key)) is not None)
+    held = whole.frozen_cells(model)
+    keys, cells = tuple(held), tuple(held.values())
     known: dict[CellKey, CellStates] = {}
     if earlier is not None and earlier.model == model:
         known = dict(zip(earlier.keys, earlier.states, strict=True))
@@ -92,7 +115,7 @@ def freeze(whole: EvidenceMap, model: SensorModel, *, earlier: FrozenMap | None 
     # Each cell's states are a part of the grid's from here on: else all of them would be held twice.
     parts = np.split(grid.words, np.cumsum([len(state.words) for state in states[:-1]], dtype=np.int64))
     shared = tuple(replace(state, words=words) for state, words in zip(states, parts, strict=False))
-    return FrozenMap(whole.geometry, model, keys, cells, shared, grid)
+    return FrozenMap(whole.geometry, model, keys, cells, shared, grid, whole.frozen_times())
 
 
 def as_points(values: npt.ArrayLike, what: str) -> Floats:

@@ -13,7 +13,8 @@ each axis, so a point on a border is in the upper one. NaN, infinity or a point 
 `BadInputError` (`point_range`), another shape `bad_points`. A `box_m` is the (2, 3) lowest and highest corner, metres,
 map frame, sides may be infinite: it holds the voxels whose centres it holds; without one, the whole map is meant.
 Lengths are metres, temperatures kelvin (apparent), colours sRGB 0 to 255. Evidence is read under the snapshot's
-`SensorModel`: probabilities are clamped, and a voxel without hits and misses is unknown.
+`SensorModel`: probabilities are clamped, and a voxel without hits and misses is unknown. Of a map with epochs, what was
+seen later outweighs what was seen before, and colours and temperatures are the newest; `seen_at` has their age.
 """
 
 from typing import Self
@@ -23,14 +24,13 @@ import numpy.typing as npt
 
 from cairn_map.arrays import Floats
 from cairn_map.evidence.channels import ChannelKind
-from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.grid import Cell, Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.evidence.voxels import Reading, Voxels
 from cairn_map.queries import body_queries, distance_queries, point_queries, region_queries
 from cairn_map.queries.body_queries import PathStates
 from cairn_map.queries.distance_queries import Nearest, RayEnds
-from cairn_map.queries.frozen_map import Box, FrozenMap, freeze
+from cairn_map.queries.frozen_map import Box, FreezableMap, FrozenMap, freeze
 from cairn_map.queries.occupancy_states import State
 from cairn_map.queries.region_queries import MapImage
 
@@ -48,7 +48,7 @@ class MapSnapshot:
     def __repr__(self) -> str:
         return f"MapSnapshot({len(self._frozen.cells)} cells, {self.geometry})"
 
-    def refreshed(self, whole: EvidenceMap) -> Self:
+    def refreshed(self, whole: FreezableMap) -> Self:
         """Snapshot of the map as it is now; only the cells that changed since this snapshot are read again."""
         return type(self)(freeze(whole, self._frozen.model, earlier=self._frozen))
 
@@ -66,6 +66,11 @@ class MapSnapshot:
     def model(self) -> SensorModel:
         """Inverse sensor model under which hits and misses are read."""
         return self._frozen.model
+
+    @property
+    def has_times(self) -> bool:
+        """True if the map has epochs, so that `seen_at` has answers."""
+        return self._frozen.times is not None
 
     def state_at(self, points_m: npt.ArrayLike) -> npt.NDArray[np.uint8]:
         """(N,) `State`: 0 unknown, 1 free, 2 occupied."""
@@ -104,6 +109,13 @@ class MapSnapshot:
     def temperature_at(self, points_m: npt.ArrayLike) -> Reading:
         """Mean (N,), standard deviation of the samples (`spread`), kelvin, and weight; first temperature channel."""
         return self._first_at(points_m, ChannelKind.TEMPERATURE)
+
+    def seen_at(self, points_m: npt.ArrayLike) -> Floats:
+        """(N,) first instant of the newest epoch in which the voxel was hit or seen through, UTC seconds since 1970.
+
+        NaN where it never was, where it was only without a time, and everywhere in a map without epochs.
+        """
+        return point_queries.seen_at(self._frozen, points_m)
 
     def cast_rays(
         self, origins_m: npt.ArrayLike, directions: npt.ArrayLike, *, max_range_m: float, ends_in_unknown: bool = False
@@ -227,7 +239,7 @@ class MapSnapshot:
         return point_queries.reading_at(self._frozen, points_m, point_queries.first_of_kind(self.geometry, kind))
 
 
-def snapshot_of(whole: EvidenceMap, model: SensorModel = STANDARD_MODEL) -> MapSnapshot:
+def snapshot_of(whole: FreezableMap, model: SensorModel = STANDARD_MODEL) -> MapSnapshot:
     """Snapshot of the map as it is now, read under a sensor model.
 
     If another thread changes the map, the caller holds it off meanwhile; a robot's `snapshot` does so.

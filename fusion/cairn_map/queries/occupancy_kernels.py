@@ -163,6 +163,22 @@ def states_of_counts_into(pool: Pool, of_hits: Floats, of_misses: Floats, least:
             words[b, w, KNOWN_BITS] = known
 
 
+@nb.njit(cache=True, nogil=True)
+def states_of_odds_into(pool: Pool, steps: npt.NDArray[np.int16], words: Words) -> None:
+    """Write the (B, 8, 2) words of a reading: (B, 512, 2) hits and misses, and (B, 512) steps above the threshold."""
+    for b in range(U(pool.shape[0])):
+        for w in range(U(8)):
+            occupied, known = U(0), U(0)
+            # One bit of each word a voxel. Only counts make it known; its log-odds are above the threshold if and only
+            # if its steps are above 0.
+            for n in range(U(64)):
+                seen = (pool[b, w * U(64) + n, 0] | pool[b, w * U(64) + n, 1]) != 0
+                known |= U(seen) << n
+                occupied |= U(seen and steps[b, w * U(64) + n] > 0) << n
+            words[b, w, OCCUPIED_BITS] = occupied
+            words[b, w, KNOWN_BITS] = known
+
+
 @nb.njit(inline="always")
 def x_in_block(n: int) -> int:
     """Place along x of voxel n of a 4^3 block; along y and z pass n >> 1 and n >> 2."""

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_map.arrays import Floats, Words
+from cairn_map.evidence.brick_cell import BrickCell
 from cairn_map.evidence.brick_counts import BrickCounts
 from cairn_map.evidence.compact_cell import HeldCell, opened, sums_of
 from cairn_map.evidence.grid import Cell, Geometry
@@ -50,8 +51,8 @@ class CellStates:
 
 def states_of_cell(cell: HeldCell, model: SensorModel) -> CellStates:
     """The states of one cell; one that is held as bytes is decoded for it."""
-    counts = opened(cell).counts
-    return CellStates(sums_of(cell), bricks_of(counts), words_of_counts(counts, model))
+    bricks = opened(cell)
+    return CellStates(sums_of(cell), bricks_of(bricks.counts), words_of_cell(bricks, model))
 
 
 def bricks_of(counts: BrickCounts) -> npt.NDArray[np.uint16]:
@@ -62,11 +63,18 @@ def bricks_of(counts: BrickCounts) -> npt.NDArray[np.uint16]:
     return bricks
 
 
-def words_of_counts(counts: BrickCounts, model: SensorModel) -> Words:
-    """(B, 8, 2) states of one cell, as bits; exactly those of `model.occupied`."""
-    pool = counts.pool
+def words_of_cell(cell: BrickCell, model: SensorModel) -> Words:
+    """(B, 8, 2) states of one cell, as bits; exactly those of `Evidence.occupied`.
+
+    Raises:
+        ValueError: the cell is a reading under another sensor model.
+    """
+    pool = cell.counts.pool
     words = np.empty((len(pool), 8, 2), np.uint64)
-    if pool.dtype == np.int16:
+    if cell.odds is not None:
+        cell.odds.check_model(model)
+        kernels.states_of_odds_into(pool, cell.odds.steps, words)
+    elif pool.dtype == np.int16:
         tables = odds_of_counts(model)  # pyright: ignore[reportArgumentType]
         kernels.states_of_counts_into(pool, *tables, log_odds(model.p_occupied), words)
     else:

@@ -123,6 +123,32 @@ def log_odds_into(
 
 
 @nb.njit(cache=True, nogil=True)
+def read_odds_into(
+    rows: Int32s,
+    places: Places,
+    bricks: npt.NDArray[np.int16],
+    pool: Pool,
+    steps: npt.NDArray[np.int16],
+    step: float,
+    zero: float,
+    least: float,
+    most: float,
+    out: Floats,
+) -> None:
+    """Write (N,) clamped log-odds of the listed points of one cell that is a reading; NaN where unknown."""
+    for n in range(U(rows.shape[0])):
+        # A place without its lowest 9 bits is the number of its brick.
+        row = U(rows[n])
+        place = U(places[row])
+        brick = U(bricks[place >> U(9)])
+        # Only counts make a voxel known.
+        seen = pool[brick, place & U(511), 0] | pool[brick, place & U(511), 1] != 0
+        # Steps count from the threshold; at a bound they reach beyond it, so that clamping gives the bound itself.
+        odds = zero + steps[brick, place & U(511)] * step
+        out[row] = min(max(odds, least), most) if seen else np.nan
+
+
+@nb.njit(cache=True, nogil=True)
 def samples_into(
     rows: Int32s,
     places: Places,

@@ -10,10 +10,9 @@ import numpy.typing as npt
 
 from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
-from cairn_map.evidence.brick_cell import BrickCell
 from cairn_map.evidence.channels import Channel, ChannelKind
 from cairn_map.evidence.grid import Geometry
-from cairn_map.evidence.inverse_sensor_model import known, log_odds
+from cairn_map.evidence.inverse_sensor_model import LOG_ODDS_STEP, known, log_odds
 from cairn_map.evidence.voxels import Reading, reading_of_sums
 from cairn_map.queries import point_kernels as kernels
 from cairn_map.queries.frozen_map import FrozenMap, as_points, check_within
@@ -21,7 +20,7 @@ from cairn_map.queries.occupancy_states import odds_of_counts
 
 CHUNK = 1 << 17
 """Points of a chunk."""
-Located = tuple[slice, BrickCell, npt.NDArray[np.int32], npt.NDArray[np.uint32]]
+Located = tuple[slice, int, npt.NDArray[np.int32], npt.NDArray[np.uint32]]
 
 
 def states_at(frozen: FrozenMap, points_m: npt.ArrayLike) -> npt.NDArray[np.uint8]:
@@ -36,8 +35,9 @@ def counts_at(frozen: FrozenMap, points_m: npt.ArrayLike) -> npt.NDArray[np.int3
     """(N, 2) hits and misses of the voxels that hold (N, 3) points; zeros where unknown."""
     points = as_points(points_m, "points")
     counts = np.zeros((len(points), 2), np.int32)
-    for part, cell, rows, places in _located(frozen, points):
-        kernels.counts_into(rows, places, cell.counts.brick_of, cell.counts.pool, counts[part])
+    for part, slot, rows, places in _located(frozen, points):
+        sums = frozen.bricks(slot).counts
+        kernels.counts_into(rows, places, sums.brick_of, sums.pool, counts[part])
     return counts
 
 
@@ -46,9 +46,14 @@ def log_odds_at(frozen: FrozenMap, points_m: npt.ArrayLike) -> Floats:
     points, model = as_points(points_m, "points"), frozen.model
     odds = np.full(len(points), np.nan)
     clamps = log_odds(model.p_min), log_odds(model.p_max)
-    for part, cell, rows, places in _located(frozen, points):
+    bounds = log_odds(model.p_occupied), *clamps
+    for part, slot, rows, places in _located(frozen, points):
+        cell = frozen.bricks(slot)
         bricks, pool = cell.counts.brick_of, cell.counts.pool
-        if pool.dtype == np.int16:
+        if cell.odds is not None:
+            cell.odds.check_model(model)
+            kernels.read_odds_into(rows, places, bricks, pool, cell.odds.steps, LOG_ODDS_STEP, *bounds, odds[part])
+        elif pool.dtype == np.int16:
             tables = odds_of_counts(model)  # pyright: ignore[reportArgumentType]
             kernels.log_odds_into(rows, places, bricks, pool, *tables, *clamps, odds[part])
         else:
@@ -73,9 +78,19 @@ def reading_at(frozen: FrozenMap, points_m: npt.ArrayLike, channel: Channel) -> 
     points = as_points(points_m, "points")
     planes = frozen.geometry.planes_of(channel.name)
     sums = np.zeros((len(points), planes.stop - planes.start), np.int64)
-    for part, cell, rows, places in _located(frozen, points):
-        kernels.samples_into(rows, places, *cell.samples.rows, planes.start, sums[part])
+    for part, slot, rows, places in _located(frozen, points):
+        kernels.samples_into(rows, places, *frozen.bricks(slot).samples.rows, planes.start, sums[part])
     return reading_of_sums(channel, sums)
+
+
+def seen_at(frozen: FrozenMap, points_m: npt.ArrayLike) -> Floats:
+    """(N,) times, UTC seconds since 1970, at which the voxels that hold (N, 3) points were seen last; NaN if never."""
+    points = as_points(points_m, "points")
+    seen_s = np.full(len(points), np.nan)
+    for part, slot, rows, places in _located(frozen, points):
+        if frozen.times is not None:
+            seen_s[part][rows] = frozen.times(frozen.keys[slot], places[rows])
+    return seen_s
 
 
 def channel_named(frozen: FrozenMap, name: str) -> Channel:
@@ -104,7 +119,7 @@ def first_of_kind(geometry: Geometry, kind: ChannelKind) -> Channel:
 
 
 def _located(frozen: FrozenMap, points: Floats) -> Iterator[Located]:
-    """For each chunk and each cell with points in its bricks: the chunk, the cell, rows in the chunk, and places."""
+    """For each chunk and each cell with points in its bricks: the chunk, the slot, rows in the chunk, and places."""
     starts = np.empty(len(frozen.cells) + 1, np.int64)
     for start in range(0, len(points), CHUNK):
         part = slice(start, min(start + CHUNK, len(points)))
@@ -113,4 +128,4 @@ def _located(frozen: FrozenMap, points: Floats) -> Iterator[Located]:
         check_within(kernels.locate_into(frozen.grid, points[part], frozen.reach_m, slots, places), frozen)
         kernels.group_into(slots, starts, order)
         for slot in np.nonzero(starts[1:] != starts[:-1])[0].tolist():
-            yield part, frozen.sums(slot), order[starts[slot] : starts[slot + 1]], places
+            yield part, slot, order[starts[slot] : starts[slot + 1]], places

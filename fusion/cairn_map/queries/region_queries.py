@@ -128,7 +128,7 @@ def voxels_in_box(frozen: FrozenMap, box_m: Box | None, *, occupied_only: bool) 
             key = frozen.keys[slot]
             evidence = frozen.cells[slot].packed()
             numbers = voxels_in_cell(evidence.voxels, key, frozen.geometry)
-            part = _rows(evidence, _are_within(numbers, low, high))
+            part = evidence.where(_are_within(numbers, low, high))
             parts.append(_voxels(frozen, key, part, occupied_only=occupied_only))
     return joined_voxels(parts or [_voxels(frozen, CellKey(0), empty_evidence(frozen.geometry), occupied_only=False)])
 
@@ -147,7 +147,7 @@ def hottest(frozen: FrozenMap, n: int, *, min_probability: float, box_m: Box | N
         sums, counts = evidence.samples[:, planes], evidence.counts[evidence.sampled]
         numbers = voxels_in_cell(evidence.voxels[evidence.sampled], key, frozen.geometry)
         # An unknown voxel's probability is NaN, and NaN is not above any number.
-        likely = frozen.model.probability(counts) >= min_probability
+        likely = evidence.probability(frozen.model, rows=evidence.sampled) >= min_probability
         (rows,) = np.nonzero((sums[:, -1] > 0) & likely & _are_within(numbers, low, high))
         rows = rows[np.argsort(-sums[rows, 0] / sums[rows, -1], kind="stable")]
         # The first n of both groups, in the order of the cell's voxels.
@@ -155,7 +155,7 @@ def hottest(frozen: FrozenMap, n: int, *, min_probability: float, box_m: Box | N
         is_sure, chosen = np.zeros((2, len(evidence)), np.bool_)
         is_sure[evidence.sampled[rows[sure]]] = True
         chosen[evidence.sampled[rows[np.concatenate([sure, doubtful])]]] = True
-        parts.append(_voxels(frozen, key, _rows(evidence, chosen), occupied_only=False))
+        parts.append(_voxels(frozen, key, evidence.where(chosen), occupied_only=False))
         confirmed.append(is_sure[chosen])
     voxels = joined_voxels(parts or [_voxels(frozen, CellKey(0), empty_evidence(frozen.geometry), occupied_only=False)])
     kelvin = voxels.readings[channel.name].mean
@@ -195,15 +195,3 @@ def _voxels(frozen: FrozenMap, key: CellKey, evidence: Evidence, *, occupied_onl
 
 def _are_within(numbers: Ints, low: Ints, high: Ints) -> npt.NDArray[np.bool_]:
     return np.asarray(((numbers >= low) & (numbers < high)).all(axis=1))
-
-
-def _rows(evidence: Evidence, keep: npt.NDArray[np.bool_]) -> Evidence:
-    """The voxels of packed evidence where `keep` is True, packed."""
-    sampled = keep[evidence.sampled]
-    new_row = np.cumsum(keep, dtype=np.int64) - 1
-    return Evidence(
-        evidence.voxels[keep],
-        evidence.counts[keep],
-        new_row[evidence.sampled[sampled]].astype(np.uint32),
-        evidence.samples[sampled],
-    )

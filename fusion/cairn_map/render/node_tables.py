@@ -30,7 +30,7 @@ FIRST_OF_NODE = np.array([0, 512, 576, 584], np.int64)
 def probability_table(cell: BrickCell, model: SensorModel) -> Table:
     """Table of the clamped probability, one plane."""
     pool = cell.counts.pool.reshape(-1, 2)
-    odds = np.where(known(pool), model.log_odds(pool), -np.inf)
+    odds = np.where(known(pool), cell.log_odds(model).reshape(-1), -np.inf)
     highest = _pyramid(odds[:, None], lambda parts: parts.max(axis=2))
     with np.errstate(over="ignore"):  # exp(inf), for unknown nodes
         return np.where(highest > -np.inf, 1 / (1 + np.exp(-highest)), np.nan).astype(np.float32)

@@ -17,7 +17,7 @@ from cairn_map.evidence.grid import CellKey, Geometry, cell_of_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.queries.frozen_map import FrozenMap
 from cairn_map.queries.map_snapshot import MapSnapshot
-from cairn_map.queries.occupancy_states import CellStates, bricks_of, state_grid, words_of_counts
+from cairn_map.queries.occupancy_states import CellStates, bricks_of, state_grid, words_of_cell
 from cairn_map.queries.point_queries import first_of_kind
 from cairn_map.render.camera_rays import CameraRays
 from cairn_map.render.map_render import CellTables, MapRenderer, SurfaceImage
@@ -71,7 +71,7 @@ def read_cell(cell: BrickCell, geometry: Geometry, model: SensorModel, layer: La
             channel = first_of_kind(geometry, kind)
             table = {channel: mean_table(cell, channel, geometry)}
     zeros = cell.zeros()
-    states = CellStates(sums_of(zeros), bricks_of(cell.counts), words_of_counts(cell.counts, model))
+    states = CellStates(sums_of(zeros), bricks_of(cell.counts), words_of_cell(cell, model))
     return ReadCell(zeros, states, CellTables(sums_of(zeros), zeros.counts.brick_of, table))
 
 

@@ -92,7 +92,8 @@ def _only(evidence: Evidence, place: int) -> Evidence:
     rows = np.array([at]) if at < len(evidence) and evidence.voxels[at] == place else np.empty(0, np.int64)
     mine = np.isin(evidence.sampled, rows)
     sampled = np.zeros(int(mine.sum()), evidence.sampled.dtype)
-    return Evidence(evidence.voxels[rows], evidence.counts[rows], sampled, evidence.samples[mine])
+    odds = None if evidence.odds is None else evidence.odds[rows]
+    return Evidence(evidence.voxels[rows], evidence.counts[rows], sampled, evidence.samples[mine], odds)
 
 
 def _readings(readings: dict[str, Reading], geometry: Geometry) -> list[ChannelReading]:

@@ -10,6 +10,7 @@ import pytest
 from tests.fixtures.client.live_server import MAP, LiveServer
 from tests.fixtures.client.made import GEOMETRY, A, opened
 
+from cairn_client.cli.maps import query
 from cairn_client.cli.maps.command import main
 from cairn_client.folders.map_folder import open_map
 from cairn_client.http.api import MapApi
@@ -17,11 +18,15 @@ from cairn_client.replica.outbox import CommitFacts
 from cairn_client.robot.robot import Robot
 from cairn_fusion.mapping.measurement import scan_pose
 from cairn_map.codec.cell_code import encode_cell
+from cairn_map.epochs.epoch import Epoch
+from cairn_map.epochs.history_map import HistoryMap
+from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import BadInputError, ConflictError, DamagedDataError
 from cairn_map.evidence.evidence import Evidence, packed_evidence
 from cairn_map.evidence.grid import cell_of_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.files.cell_folder import FolderHead, write_cell, write_head
+from cairn_map.queries.map_snapshot import snapshot_of
 from cairn_map.wire.messages import CreateMap
 
 Place = Path | str
@@ -186,3 +191,16 @@ def test_a_question_that_is_none_is_a_wrong_usage(tmp_path: Path, words: list[st
     with pytest.raises(SystemExit) as ended:
         main(["query", str(tmp_path), *words])
     assert ended.value.code == 2
+
+
+def test_points_of_a_map_with_epochs_say_when_they_were_seen(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = HistoryMap(MapLayer(geometry=GEOMETRY, epoch_s=600))
+    whole.merge({A: evidence()}, epoch=Epoch(3_000_000))
+    monkeypatch.setattr(query, "open_map", lambda *_, **__: snapshot_of(whole))
+    point, unknown = "0.06,0.06,0.06", "9,9,9"
+    found = answered(capsys, "lab", "points", point, unknown)
+    assert [it["seen_s"] for it in found] == [1.8e9, None]
+    lines = asked(capsys, "lab", "points", point, unknown).splitlines()
+    assert [line.split()[-1] for line in lines] == ["seen", "2027-01-15T08:00Z", "-"]

@@ -14,6 +14,7 @@
 A map is a URL, whose cells are all downloaded first, or a folder: one of `cairn map export --cells`, a clone, or the
 state folder of a robot that is not running. All lengths are
 metres in the map's frame, temperatures degrees Celsius here and kelvin in JSON; unknown values are `-`, in JSON null.
+Of a map with epochs, points have the time at which they were seen last, too: the beginning of its newest epoch, UTC.
 --json prints JSON for programs; `slice` and `height` then give all pixels, rows along y and columns along x.
 """
 
@@ -21,6 +22,7 @@ import argparse
 import json
 import math
 from collections.abc import Callable
+from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
@@ -97,16 +99,21 @@ def _points(snapshot: MapSnapshot, args: argparse.Namespace) -> tuple[Any, list[
     counts = snapshot.counts_at(points).tolist()
     readings = {c.name: snapshot.reading_at(points, c.name) for c in snapshot.geometry.channels}
     widths = {name: max(14, len(name)) for name in readings}
+    # A map with epochs says when each voxel was seen last.
+    seen_s = snapshot.seen_at(points).tolist() if snapshot.has_times else None
+    widths |= {"seen": len("2026-01-31T12:00Z")} if seen_s else {}
     lines = [f"{'x m':>8}{'y m':>8}{'z m':>8}  {'state':<9}{SURENESS}" + _columns(widths, widths.keys())]
     found = []
     for n, (x, y, z) in enumerate(args.points):
         state, p = State(int(states[n])).name.lower(), _or_none(probability[n])
         shown = {name: _shown(reading, n) for name, reading in readings.items()}
+        times = {"seen_s": _or_none(seen_s[n])} if seen_s else {}
+        shown |= {"seen": _minute(seen_s[n])} if seen_s else {}
         text = f"{x:8.3f}{y:8.3f}{z:8.3f}  {state:<9}{_sureness(p, *counts[n])}"
         lines.append(text + _columns(widths, shown.values()))
         values = {name: _value(reading, n) for name, reading in readings.items()}
         sure = {"probability": p, "hits": counts[n][0], "misses": counts[n][1]}
-        found.append({"point_m": [x, y, z], "state": state, **sure, "readings": values})
+        found.append({"point_m": [x, y, z], "state": state, **sure, **times, "readings": values})
     return found, lines
 
 
@@ -165,6 +172,11 @@ def _corners(args: argparse.Namespace) -> npt.NDArray[np.float64] | None:
 
 def _or_none(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
+
+
+def _minute(time_s: float) -> str:
+    """Time in UTC to the minute."""
+    return f"{datetime.fromtimestamp(time_s, UTC):%Y-%m-%dT%H:%MZ}" if math.isfinite(time_s) else "-"
 
 
 def _sureness(p: float | None, hits: int, misses: int) -> str:
