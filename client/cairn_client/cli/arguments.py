@@ -10,17 +10,21 @@ import os
 import re
 import sys
 from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
 from typing import Any, TypeAlias
 
 from cairn_client.http.api import MapApi
 from cairn_client.http.map_url import split_map_url
 from cairn_client.http.origin_tokens import NO_TOKENS, OriginTokens
 from cairn_client.sync.responses import shown_text
-from cairn_map.errors import EXIT_CODES
+from cairn_map.errors import EXIT_CODES, BadInputError
 
 TOKEN_VARIABLE = "CAIRN_TOKEN"  # noqa: S105 - the variable's name
 NEGATIVE = re.compile(r"-\d[-\d.]*[,:][-\d.,:]*|-[xyz]")
 """A list or span that begins with a negative number, or an axis: `-1,0,0`, `-5:40`, `-y`."""
+
+SECONDS = re.compile(r"\d{9,11}(\.\d+)?")
+"""Seconds since 1970, after 1973."""
 
 Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 Run: TypeAlias = Callable[[argparse.Namespace], int]
@@ -143,3 +147,26 @@ def shown_age(seconds: float) -> str:
         if seconds < limit:
             return f"{max(0.0, seconds) / size:.0f} {unit}"
     return f"{seconds / 86_400:.0f} d"
+
+
+def seconds_of(text: str | None, *, now: datetime | None = None) -> float | None:
+    """UTC seconds since 1970 of a time of today, or of a date and time, UTC unless it says otherwise; None for None.
+
+    Raises:
+        BadInputError: kind `bad_time`.
+    """
+    if text is None:
+        return None
+    if SECONDS.fullmatch(text):
+        return float(text)
+    today = (now or datetime.now(UTC)).date().isoformat()
+    for whole in (text, f"{today}T{text}"):
+        try:
+            when = datetime.fromisoformat(whole)
+        except ValueError:
+            continue
+        return (when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp()
+    raise BadInputError(
+        "bad_time",
+        f"a time is 14:05, 2026-11-20T14:05 or 2026-11-20T14:05+01:00 (else UTC), or seconds since 1970; got {text!r}",
+    )

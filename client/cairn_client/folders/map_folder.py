@@ -19,9 +19,10 @@ from cairn_map.codec.layer_code import row_bodies
 from cairn_map.epochs.history_map import HistoryMap
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.grid import CellKey, cell_of_key
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.files.cell_folder import MAP_FILE, cell_path, read_cells, read_head
 from cairn_map.machine_memory import standard_limit_bytes
-from cairn_map.queries.map_snapshot import MapSnapshot, snapshot_of
+from cairn_map.queries.map_snapshot import MapSnapshot, snapshot_at, snapshot_of
 from cairn_map.render.map_picture import Ages
 
 
@@ -34,7 +35,9 @@ class FolderMap:
     """Ages of what the robot measured itself; None for a folder of cells, which have no times."""
 
 
-def open_map(place: Path | str, *, token: str | None = None, memory_bytes_max: int | None = None) -> MapSnapshot:
+def open_map(
+    place: Path | str, *, token: str | None = None, memory_bytes_max: int | None = None, at_s: float | None = None
+) -> MapSnapshot:
     """A map as a snapshot to ask, from a server or a folder, without a robot.
 
         open_map("http://base:8750/maps/lab").probability_at([[1.0, 2.0, 0.4]])
@@ -47,8 +50,10 @@ def open_map(place: Path | str, *, token: str | None = None, memory_bytes_max: i
             folder of a robot or copy that is not running.
         token: for a server that wants one.
         memory_bytes_max: largest size in memory of a map from a server; None: a quarter of the machine's memory.
+        at_s: UTC seconds since 1970: the map as it was then, by time of capture; None: now.
 
     Raises:
+        ConflictError: kind `not_known`: with `at_s`, of a map without epochs.
         BadInputError: kind `no_map_folder`: the folder holds neither cells nor a robot's state; a bad URL; no token.
             Kind `too_large`: the server's map does not fit into the memory limit.
         ConflictError: a robot has its state open.
@@ -57,12 +62,12 @@ def open_map(place: Path | str, *, token: str | None = None, memory_bytes_max: i
         UnreachableError: the server does not answer.
     """
     if isinstance(place, str) and "://" in place:
-        return _downloaded_map(place, token, memory_bytes_max or standard_limit_bytes())
-    return map_of_folder(Path(place)).snapshot
+        return _downloaded_map(place, token, memory_bytes_max or standard_limit_bytes(), at_s)
+    return map_of_folder(Path(place), at_s=at_s).snapshot
 
 
-def map_of_folder(folder: Path) -> FolderMap:
-    """The map in a folder, under its own sensor model, and how old it is where that is known.
+def map_of_folder(folder: Path, *, at_s: float | None = None) -> FolderMap:
+    """The map in a folder, under its own sensor model, now or at a time, and how old it is where that is known.
 
     Raises:
         BadInputError: kind `no_map_folder`: it holds neither cells nor a robot's state.
@@ -71,14 +76,14 @@ def map_of_folder(folder: Path) -> FolderMap:
     """
     if is_state_folder(folder):
         with opened_replica(folder) as replica:
-            return FolderMap(replica.snapshot(), ages_of(replica))
+            return FolderMap(replica.snapshot(at_s=at_s), ages_of(replica))
     if (folder / MAP_FILE).is_file():
         head = read_head(folder)
         whole = HistoryMap(head.layer, coding=coding_of(head.geometry))
         for cell in read_cells(folder, head.layer):
             size_bytes = cell_path(folder, cell_of_key(cell.key)).stat().st_size
             whole.replace(cell.key, cell.history, came_bytes=size_bytes)
-        return FolderMap(snapshot_of(whole.base, head.sensor_model), None)
+        return FolderMap(_snapshot(whole, head.sensor_model, at_s), None)
     raise BadInputError(
         "no_map_folder",
         f"{folder} holds no map: neither {MAP_FILE} and cells (`cairn map export URL --cells DIR`) nor a robot's "
@@ -86,7 +91,7 @@ def map_of_folder(folder: Path) -> FolderMap:
     )
 
 
-def _downloaded_map(map_url: str, token: str | None, memory_bytes_max: int) -> MapSnapshot:
+def _downloaded_map(map_url: str, token: str | None, memory_bytes_max: int, at_s: float | None) -> MapSnapshot:
     server_url, name = split_map_url(map_url)
     with MapApi(server_url, token=token) as api:
         info = api.map_info(name)
@@ -104,7 +109,11 @@ def _downloaded_map(map_url: str, token: str | None, memory_bytes_max: int) -> M
             whole.replace(key, decoded.history, bodies=row_bodies(body, key, info.layer), came_bytes=len(body))
             if whole.size_bytes > memory_bytes_max:
                 raise _too_large(map_url, memory_bytes_max)
-    return snapshot_of(whole.base, info.sensor_model)
+    return _snapshot(whole, info.sensor_model, at_s)
+
+
+def _snapshot(whole: HistoryMap, model: SensorModel, at_s: float | None) -> MapSnapshot:
+    return snapshot_of(whole, model) if at_s is None else snapshot_at(whole, model, at_s)
 
 
 def _too_large(map_url: str, memory_bytes_max: int) -> BadInputError:

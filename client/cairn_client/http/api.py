@@ -9,7 +9,7 @@ import contextlib
 import socket
 import threading
 import weakref
-from collections.abc import Generator, Iterator, Mapping
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
@@ -39,6 +39,7 @@ from cairn_map.wire.access_messages import (
     SiteInfo,
     TokenInfo,
 )
+from cairn_map.wire.change_messages import ChangesAnswer
 from cairn_map.wire.frames import FRAME_BYTES_MAX, JSON_BYTES_MAX, Frame
 from cairn_map.wire.messages import (
     INDEX_PAGE,
@@ -337,6 +338,14 @@ class MapApi:
         index = found.model_copy(update={"header": found.header.whole(held, since=since)})
         self._vector = index.header.coverage
         return index
+
+    def changes(
+        self, name: str, *, since_s: float | None, until_s: float | None = None, box_m: Sequence[float] | None = None
+    ) -> ChangesAnswer:
+        """What changed in a map between two times of capture; a box is x0, y0, z0, x1, y1, z1 in metres."""
+        asked = {"since": since_s, "until": until_s, "box": ",".join(map(str, box_m)) if box_m else None}
+        params = {key: str(value) for key, value in asked.items() if value is not None}
+        return message_from_json(ChangesAnswer, self._ask("GET", f"/maps/{name}/main/changes", params=params))
 
     def vector_at(self, name: str, cursor: str) -> VersionVector:
         """The ids that a server had folded at a cursor."""

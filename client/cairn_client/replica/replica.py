@@ -39,7 +39,7 @@ from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.fingerprint import Fingerprint
 from cairn_map.evidence.grid import Cell, CellKey, Geometry, cell_of_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
-from cairn_map.queries.map_snapshot import MapSnapshot, snapshot_of
+from cairn_map.queries.map_snapshot import MapSnapshot, snapshot_at, snapshot_of
 from cairn_map.wire.messages import ReplyHeader
 
 log = logging.getLogger(__name__)
@@ -446,20 +446,29 @@ class Replica:
             self._base.drop(keys)
             self._snapshot = None
 
-    def snapshot(self, model: SensorModel | None = None) -> MapSnapshot:
-        """The view as it is now, unmoved by what comes later, under the map's own sensor model or another one."""
+    def snapshot(self, model: SensorModel | None = None, *, at_s: float | None = None) -> MapSnapshot:
+        """The view as it is now, unmoved by what comes later, under the map's own sensor model or another one.
+
+        With `at_s`, UTC seconds since 1970, as what was captured up to the end of that time's epoch shows it.
+
+        Raises:
+            ConflictError: kind `not_known`: a map without epochs holds one sum, and knows nothing of earlier times.
+        """
         with self._lock:
             model = self.state.map_model() if model is None else model
+            if at_s is not None:
+                return snapshot_at(self.view, model, at_s)
             if self._snapshot is not None and self._snapshot.model == model:
-                self._snapshot = self._snapshot.refreshed(self.view.base)
+                self._snapshot = self._snapshot.refreshed(self.view)
             else:
-                self._snapshot = snapshot_of(self.view.base, model)
+                self._snapshot = snapshot_of(self.view, model)
             return self._snapshot
 
     def memory_bytes(self) -> int:
         """Memory of the view, and of the last snapshot besides the cells that they share."""
         with self._lock:
-            return self.view.size_bytes + (self._snapshot.frozen.size_bytes if self._snapshot else 0)
+            frozen_bytes = self._snapshot.frozen.size_bytes if self._snapshot else 0
+            return self.view.size_bytes + self.view.reading_bytes + frozen_bytes
 
     def close(self) -> None:
         """Close the file."""

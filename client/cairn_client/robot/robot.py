@@ -261,14 +261,18 @@ class Robot:
         """Commits that the server has not yet acknowledged."""
         return len(self._replica.push_set())
 
-    def snapshot(self, model: SensorModel | None = None) -> MapSnapshot:
+    def snapshot(self, model: SensorModel | None = None, *, at_s: float | None = None) -> MapSnapshot:
         """The map as it is now, unchanged by what comes later; by any thread.
 
         Args:
             model: sensor model to read the evidence under; None: the map's own, which the server states.
+            at_s: UTC seconds since 1970: the map as it was then, by time of capture, to the end of that time's epoch.
+
+        Raises:
+            ConflictError: kind `not_known`: the map has no epochs, so it holds nothing of earlier times.
         """
         self._check_open()
-        return self._replica.snapshot(model)
+        return self._replica.snapshot(model, at_s=at_s)
 
     def events(self, *, size: int = SIZE) -> EventStream:
         """Stream of the events from here on (`robot_events`), for one reader.

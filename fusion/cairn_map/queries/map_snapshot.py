@@ -23,6 +23,10 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_map.arrays import Floats
+from cairn_map.epochs.epoch import epoch_of
+from cairn_map.epochs.history_map import HistoryMap
+from cairn_map.epochs.map_reading import MapReading
+from cairn_map.errors import ConflictError
 from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.grid import Cell, Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
@@ -245,3 +249,20 @@ def snapshot_of(whole: FreezableMap, model: SensorModel = STANDARD_MODEL) -> Map
     If another thread changes the map, the caller holds it off meanwhile; a robot's `snapshot` does so.
     """
     return MapSnapshot(freeze(whole, model))
+
+
+def snapshot_at(whole: HistoryMap, model: SensorModel, time_s: float) -> MapSnapshot:
+    """Snapshot of a map as it was at a time (UTC seconds since 1970), by time of capture: to the end of its epoch.
+
+    Raises:
+        ConflictError: kind `not_known`: a map without epochs holds one sum, and knows nothing of earlier times.
+        BadInputError: kind `bad_epoch`.
+    """
+    epoch_s = whole.layer.epoch_s
+    if epoch_s is None:
+        raise ConflictError(
+            "not_known",
+            "this map has no epochs: it holds one sum for all times. Ask its server, which may have kept the commits, "
+            "or make maps with `cairn map create --epoch 120`",
+        )
+    return snapshot_of(MapReading(whole.copy(), at=epoch_of(time_s, epoch_s)), model)

@@ -8,6 +8,7 @@
     $ cairn map get http://127.0.0.1:8750/maps/lab 0,0,0 -o cell.ply
     $ cairn map export http://127.0.0.1:8750/maps/lab --ply lab.ply --picture lab.png --cells lab/
     $ cairn map log http://127.0.0.1:8750/maps/lab --graph
+    $ cairn map changes http://127.0.0.1:8750/maps/lab --since 14:05
     $ cairn map branches http://127.0.0.1:8750/maps/lab
     $ cairn map retract http://127.0.0.1:8750/maps/lab --robot mole --pushed-after 14:05 --dry-run
     $ cairn map robots list http://127.0.0.1:8750/maps/lab
@@ -23,7 +24,6 @@ import argparse
 import json
 import re
 import time
-from datetime import UTC, datetime
 from pathlib import Path
 
 from cairn_calib.rig.rig import load_rig
@@ -34,10 +34,11 @@ from cairn_client.cli.arguments import (
     api_of,
     run_subcommand,
     say,
+    seconds_of,
     shown_bytes,
     shown_length,
 )
-from cairn_client.cli.maps import branch_table, create, map_export, map_log, query, render, robots, server_copy
+from cairn_client.cli.maps import branch_table, changes, create, map_export, map_log, query, render, robots, server_copy
 from cairn_client.http.api import MapApi
 from cairn_client.sync.responses import one_line
 from cairn_map.errors import BadInputError
@@ -56,6 +57,7 @@ def main(argv: list[str]) -> int:
         _add_info,
         branch_table.add_parser,
         map_log.add_parser,
+        changes.add_parser,
         map_export.add_get_parser,
         map_export.add_export_parser,
         query.add_parser,
@@ -171,23 +173,3 @@ def rig_digest(text: str) -> str:
             f"--rig takes a rig.json, or the 64 hex digits that commits state of it; {text!r} is neither",
         )
     return load_rig(text).digest()
-
-
-def seconds_of(text: str | None, *, now: datetime | None = None) -> float | None:
-    """UTC seconds since 1970 of a time of today, or a date and time, UTC unless it says otherwise; None for None.
-
-    Raises:
-        BadInputError: kind `bad_time`.
-    """
-    if text is None:
-        return None
-    today = (now or datetime.now(UTC)).date().isoformat()
-    for whole in (text, f"{today}T{text}"):
-        try:
-            when = datetime.fromisoformat(whole)
-        except ValueError:
-            continue
-        return (when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp()
-    raise BadInputError(
-        "bad_time", f"a time is 14:05, 2026-11-20T14:05 or 2026-11-20T14:05+01:00 (else UTC), got {text!r}"
-    )

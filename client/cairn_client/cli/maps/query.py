@@ -10,6 +10,7 @@
     $ cairn map query lab/ hottest --count 5                  # where it is hot, hit twice or on a surface first
     $ cairn map query lab/ slice 0.5                          # a horizontal layer: # occupied, . free
     $ cairn map query lab/ height --box=-5,-5,0,5,5,2         # the highest surface of each column, metres
+    $ cairn map query lab/ --at 14:05 nearest 1,2,0.4         # as it was then, in a map with epochs
 
 A map is a URL, whose cells are all downloaded first, or a folder: one of `cairn map export --cells`, a clone, or the
 state folder of a robot that is not running. All lengths are
@@ -28,7 +29,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cairn_client.cli.arguments import Subparsers, add_token, say
+from cairn_client.cli.arguments import Subparsers, add_token, say, seconds_of
 from cairn_client.cli.robot_arguments import box, place
 from cairn_client.folders.map_folder import open_map
 from cairn_map.evidence.channels import ChannelKind
@@ -53,6 +54,9 @@ def add_parser(commands: Subparsers) -> None:
     query = commands.add_parser("query", help=text, description=__doc__)
     query.add_argument("map", metavar="URL|DIR", help="http://HOST:PORT/maps/NAME, cells, a clone, or a robot's state")
     add_token(query)
+    query.add_argument(
+        "--at", metavar="TIME", help="the map as it was at a time of capture (14:05, 2026-11-27T14:05, else UTC); now"
+    )
     query.set_defaults(run=_run)
     questions = query.add_subparsers(required=True, metavar="QUESTION")
 
@@ -87,7 +91,7 @@ def add_parser(commands: Subparsers) -> None:
 def _run(args: argparse.Namespace) -> int:
     answer: Answer = args.answer
     token = args.token.of(args.map) if "://" in args.map else None
-    found, lines = answer(open_map(args.map, token=token), args)
+    found, lines = answer(open_map(args.map, token=token, at_s=seconds_of(args.at)), args)
     for line in [json.dumps(found)] if args.json else lines:
         say(line)
     return 0
