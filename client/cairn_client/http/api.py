@@ -367,6 +367,10 @@ class MapApi:
         except KeyError as exc:
             raise DamagedDataError("bad_message", f"the answer for cell {cell} lacks its header {exc}") from exc
 
+    def cell_view(self, name: str, cell: Cell) -> bytes:
+        """View of one cell's voxels, known ones, with log-odds: how it reads now."""
+        return self._ask("GET", f"/maps/{name}/main/cells/{cell}.view", params={"known": "true"})
+
     def put_cell(self, name: str, cell: Cell, data: bytes) -> None:
         """Put a damaged cell right; a sound one stays as it is, and of other bytes nothing is taken."""
         headers = {"Content-Type": "application/vnd.cairn.cell"}

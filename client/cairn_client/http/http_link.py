@@ -13,6 +13,7 @@ from cairn_client.sync.requests import (
     GetIndex,
     GetMissing,
     GetUpload,
+    GetView,
     NextFrame,
     Push,
     PutCell,
@@ -75,6 +76,8 @@ class Link:
                 return next(self._frames, None) if self._frames else None
             case GetIndex(author, box, after, held):
                 return api.cell_index(name, author, box=box, after=after, held=held)
+            case GetView(cell):
+                return api.cell_view(name, cell)
             case GetCell(cell, etag):
                 return api.cell(name, cell, etag=etag)
             case PutCell(cell, body):

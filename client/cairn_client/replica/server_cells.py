@@ -16,6 +16,7 @@ from cairn_client.replica.replica_state import ReplicaState
 from cairn_client.replica.replica_store import BaseCell, KeptCommit
 from cairn_map.codec.cell_code import coding_of
 from cairn_map.codec.layer_code import decode_layer_cell, encode_layer_cell, row_bodies
+from cairn_map.codec.view_code import decode_view
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.ids import CommitId
@@ -24,9 +25,12 @@ from cairn_map.epochs.cell_history import NOTHING, CellHistory, history_fingerpr
 from cairn_map.epochs.history_map import HistoryMap
 from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import CairnError, DamagedDataError
+from cairn_map.evidence.brick_cell import reading_cell
 from cairn_map.evidence.evidence_map import Diff
 from cairn_map.evidence.fingerprint import ZERO
 from cairn_map.evidence.grid import CellKey, cell_of_key
+from cairn_map.evidence.inverse_sensor_model import SensorModel
+from cairn_map.evidence.view import evidence_of_view
 
 log = logging.getLogger(__name__)
 
@@ -164,6 +168,19 @@ class ServerCells:
         """Forget all cells, which the store does not hold any more, without a change of the view."""
         self.cells.clear()
         self.default_cursor, self._default_coverage = None, EMPTY
+
+    def show_view(self, key: CellKey, data: bytes, model: SensorModel) -> None:
+        """Show a cell that is not held as the server reads it, until its rows come (rule S6).
+
+        Raises:
+            DamagedDataError: the bytes are no view of this cell.
+            BadInputError: they are of another version, too large, or of another style.
+        """
+        found, geometry = decode_view(data), self._layer.geometry
+        if (found.key, found.voxel_edge_um, found.cell_depth) != (key, geometry.voxel_edge_um, geometry.depth):
+            raise DamagedDataError("bad_view", f"expected a view of cell {cell_of_key(key)}, got another")
+        reading = evidence_of_view(found.view, geometry, model)
+        self.view.show(key, reading_cell(geometry, reading, model))
 
     def refresh(self, key: CellKey) -> None:
         """Make the view of a cell its base, changed by the commits that are kept (rule 7)."""

@@ -134,6 +134,13 @@ class GetIndex(Ask[CellIndex]):
 
 
 @dataclass(frozen=True, slots=True)
+class GetView(Ask[bytes]):
+    """Question for the view of one cell: its voxels, free ones, too, as they read now."""
+
+    cell: Cell
+
+
+@dataclass(frozen=True, slots=True)
 class GetCell(Ask[FetchedCell]):
     """Question for one cell, unless it is the one with this ETag."""
 

@@ -7,7 +7,7 @@ from cairn_client.replica.replica import Replica
 from cairn_client.sync.exchange import is_within
 from cairn_client.sync.near_cells import Wanted
 from cairn_client.sync.requests import Box, Conversation
-from cairn_client.sync.sync import RoundReport, fetch_cells, fetch_missing
+from cairn_client.sync.sync import RoundReport, fetch_cells, fetch_missing, fetch_present
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.grid import CELL_LIMIT, Cell, cell_key
 
@@ -74,6 +74,9 @@ def fetch(
         needed = is_in_scope if box or wanted else None
         most = scope.round_bytes_max
         return (yield from fetch_cells(replica, wanted=needed, box=box, round_bytes_max=most, near=near))
+    # Who joins a map with a long history sees the present first; so does who comes to another server.
+    if replica.layer.has_epochs and replica.header is None:
+        yield from fetch_present(replica, box=box, near=near)
     report = yield from fetch_missing(
         replica,
         box=box,

@@ -8,12 +8,13 @@ A map without epochs has the base alone, and is held as an `EvidenceMap` is.
 """
 
 import hashlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 
 from cairn_map.epochs.cell_history import CellHistory, cell_history
 from cairn_map.epochs.epoch import BASE, Epoch
 from cairn_map.epochs.layer import MapLayer
 from cairn_map.epochs.map_reading import MapReading
+from cairn_map.evidence.brick_cell import BrickCell
 from cairn_map.evidence.compact_cell import CellCoding, HeldCell, VoxelTimes
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.evidence_map import NO_BODIES, Bodies, Diff, EvidenceMap
@@ -31,8 +32,8 @@ class HistoryMap:
         self.layer = layer
         self._coding = coding
         self._rows: dict[Epoch, EvidenceMap] = {BASE: EvidenceMap(layer.geometry, coding=coding)}
-        self._versions: dict[CellKey, int] = {}
-        self._version = 0
+        self._shown: dict[CellKey, HeldCell] = {}
+        """Readings of cells whose rows are still to come, by number."""
         self._reading: MapReading | None = None
 
     def __iter__(self) -> Iterator[CellKey]:
@@ -106,7 +107,6 @@ class HistoryMap:
             BadInputError: kind `evidence_overflow`; nothing was changed.
         """
         self._of(epoch).merge(diff, bodies=bodies)
-        self._note(diff)
         if self._reading is not None:
             self._reading.note(diff, epoch=epoch, sign=1)
 
@@ -117,7 +117,6 @@ class HistoryMap:
             BadInputError: kind `evidence_overflow`; nothing was changed.
         """
         self._of(epoch).unmerge(diff)
-        self._note(diff)
         if self._reading is not None:
             self._reading.note(diff, epoch=epoch, sign=-1)
 
@@ -136,20 +135,21 @@ class HistoryMap:
             self._rows[epoch].drop(key)
         for epoch, row in history.rows.items():
             self._of(epoch).replace(key, row, body=bodies.get(epoch), came_bytes=came_bytes)
-        self._note((key,))
+        self._shown.pop(key, None)
         if self._reading is not None:
             self._reading.forget((key,))
+
+    def show(self, key: CellKey, reading: HeldCell) -> None:
+        """Show a cell as this reading, made by the server, until rows of it come (rule S6)."""
+        if key not in self:
+            self._shown[key] = reading
 
     def copy(self) -> "HistoryMap":
         """The same rows, unaffected by later merges; cells share their arrays until one of the two is changed."""
         copied = HistoryMap(self.layer, coding=self._coding)
         copied._rows = {epoch: row.copy() for epoch, row in self._rows.items()}
-        copied._versions, copied._version = dict(self._versions), self._version
+        copied._shown = dict(self._shown)
         return copied
-
-    def version(self, key: CellKey) -> int:
-        """Number that is another one after each change of a cell."""
-        return self._versions.get(key, 0)
 
     def frozen_cells(self, model: SensorModel) -> dict[CellKey, HeldCell]:
         """All cells as they read now, rising in number, unaffected by later changes; sums in a map without epochs."""
@@ -158,7 +158,10 @@ class HistoryMap:
         # Made here and not with the map: a copy needs none, and would be freed late with one, which refers to it.
         if self._reading is None:
             self._reading = MapReading(self)
-        return self._reading.frozen_cells(model)
+        cells = self._reading.frozen_cells(model)
+        # A reading cannot be made again under another model.
+        shown = {key: cell for key, cell in self._shown.items() if key not in cells and is_of_model(cell, model)}
+        return dict(sorted((cells | shown).items())) if shown else cells
 
     def frozen_times(self) -> VoxelTimes | None:
         """Times at which voxels were seen last; None in a map without epochs."""
@@ -190,9 +193,8 @@ class HistoryMap:
 
     def clear(self) -> None:
         """Drop all cells."""
-        keys = list(self)
         self._rows = {BASE: EvidenceMap(self.geometry, coding=self._coding)}
-        self._note(keys)
+        self._shown.clear()
         self._reading = None
 
     def _of(self, epoch: Epoch) -> EvidenceMap:
@@ -203,6 +205,7 @@ class HistoryMap:
             self._rows[min(newest, epoch)].rest()
         return self._rows[epoch]
 
-    def _note(self, keys: Iterable[CellKey]) -> None:
-        self._version += 1
-        self._versions.update(dict.fromkeys(keys, self._version))
+
+def is_of_model(cell: HeldCell, model: SensorModel) -> bool:
+    """True if a cell may be read under a sensor model: sums under any, a reading under its own."""
+    return not isinstance(cell, BrickCell) or cell.odds is None or cell.odds.model == model

@@ -199,3 +199,44 @@ def _by_node(sums: Ints, rows: Ints) -> tuple[Ints, Ints, Ints]:
     mine = rows[there]
     starts = np.nonzero(np.diff(mine, prepend=-1))[0]
     return mine[starts], starts, sums[there]
+
+
+def evidence_of_view(view: View, geometry: Geometry, model: SensorModel) -> Evidence:
+    """Reading of a cell's voxels that a view shows; a view knows no counts, so that each voxel has one.
+
+    Args:
+        view: of the cell's voxels, with log-odds.
+        geometry: the map's.
+        model: inverse sensor model of the view.
+
+    Raises:
+        BadInputError: kind `bad_style`: a view of coarser nodes, or of probabilities in bytes.
+    """
+    if view.depth != geometry.depth or view.style.chance is not Chance.LOG_ODDS:
+        raise BadInputError("bad_style", "a reading is made of a view of voxels with log-odds")
+    low, high = log_odds(model.p_min), log_odds(model.p_max)
+    odds = np.clip((view.chances - LOG_ODDS_ZERO) * LOG_ODDS_STEP, low, high)
+    is_occupied = odds > log_odds(model.p_occupied)
+    samples = np.zeros((len(view), geometry.plane_count), np.int64)
+    _put_samples(samples, view.coloured, view.colour.astype(np.float64), geometry, ChannelKind.COLOUR)
+    _put_samples(samples, view.warm, view.temperature_k[:, :1], geometry, ChannelKind.TEMPERATURE)
+    sampled = np.nonzero(samples.any(axis=1))[0]
+    return Evidence(
+        voxels=view.nodes,
+        counts=np.stack([is_occupied, ~is_occupied], axis=1).astype(np.int32),
+        sampled=sampled.astype(np.uint32),
+        samples=samples[sampled],
+        odds=odds,
+    )
+
+
+def _put_samples(samples: Ints, rows: Ints, values: Floats, geometry: Geometry, kind: ChannelKind) -> None:
+    """Put one sample of these values into rows of the first channel of a kind."""
+    channel = next((c for c in geometry.channels if c.kind is kind), None)
+    if channel is None or not len(rows):
+        return
+    planes = geometry.planes_of(channel.name)
+    steps = np.rint((values - channel.zero) / channel.step).astype(np.int64)
+    # Sums, the square where the channel has one, and the weight.
+    squares = [steps[:, :1] ** 2] if planes.stop - planes.start == steps.shape[1] + 2 else []
+    samples[rows, planes] = np.concatenate([steps, *squares, np.ones((len(rows), 1), np.int64)], axis=1)
