@@ -3,9 +3,11 @@
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from tests.fixtures.client.made import (
     GEOMETRY,
+    WITH_EPOCHS,
     A,
     B,
     added,
@@ -27,8 +29,10 @@ from cairn_map.commits.commit import Commit, CommitMeta, make_commit, split_comm
 from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.ids import CommitId
 from cairn_map.commits.version_vector import EMPTY, VersionVector
-from cairn_map.evidence.evidence import Evidence
-from cairn_map.evidence.grid import CellKey, cell_key
+from cairn_map.epochs.epoch import Epoch
+from cairn_map.evidence.evidence import Evidence, packed_evidence
+from cairn_map.evidence.grid import CellKey, cell_key, centres_of_voxels, voxels_in_cell
+from cairn_map.queries.occupancy_states import State
 from cairn_map.wire.frames import FrameKind
 
 C1, C2, C3 = cursor(1), cursor(2), cursor(3)
@@ -196,3 +200,20 @@ def test_what_was_taken_out_of_a_cell_that_is_empty_then_stays_out_when_the_retr
     assert mole.commits == []
     assert len(mole.view.evidence(A)) == 0
     assert is_the_same_after_a_restart(mole, tmp_path)
+
+
+def test_a_snapshot_of_a_map_with_epochs_shows_what_is_there_now(tmp_path: Path) -> None:
+    replica = opened(tmp_path, layer=WITH_EPOCHS)
+    wall, air = (
+        packed_evidence(np.zeros(1, np.uint32), np.array([counts]), np.zeros((1, GEOMETRY.plane_count)), GEOMETRY)
+        for counts in ((200, 0), (0, 9))
+    )
+    point = centres_of_voxels(voxels_in_cell(wall.voxels, A, GEOMETRY), GEOMETRY)
+    replica.commit({A: wall}, CommitFacts(epoch=Epoch(3)))
+    before = replica.snapshot()
+    replica.commit({A: air}, CommitFacts(epoch=Epoch(5)))
+    now = replica.snapshot()
+    replica.close()
+    assert (before.state_at(point)[0], now.state_at(point)[0]) == (State.OCCUPIED, State.FREE)
+    assert now.counts_at(point).tolist() == [[200, 9]]
+    assert (before.seen_at(point)[0], now.seen_at(point)[0]) == (3 * 120, 5 * 120)
