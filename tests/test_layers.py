@@ -103,7 +103,7 @@ MAY_NAME = {
 
 ROOMS = {
     "cairn_map": """
-        errors arrays progress machine_memory
+        errors arrays progress machine_memory machine_clocks
         kernels evidence epochs codec.octree codec.entropy codec commits wire files queries render
         warm_up
     """,

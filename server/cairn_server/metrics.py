@@ -193,6 +193,18 @@ def memory_metrics(limit_bytes: int) -> Iterator[Metric]:
     yield GaugeMetricFamily("cairn_memory_bytes", "Memory that all processes take together.", used_bytes())
 
 
+def clock_metrics(doubt_s: float) -> Iterator[Metric]:
+    """Doubt of the store's clock."""
+    yield GaugeMetricFamily(
+        "cairn_clock_doubt_seconds", "Since the store's time of day is not trusted; 0 while it is.", doubt_s
+    )
+
+
+RELEASED_S = 1_795_478_400.0
+"""Date of this program, UTC seconds since 1970 (2026-11-24): a clock that stands before it is wrong. To be moved on
+with each release; never ahead of it."""
+
+
 def program_version() -> str:
     """Version of cairn, `unknown` where it runs from its sources."""
     try:

@@ -32,6 +32,7 @@ from cairn_server.live.site import Site
 from cairn_server.maps import Maps
 from cairn_server.metrics import (
     ServerFigures,
+    clock_metrics,
     memory_metrics,
     metrics_text,
     process_metrics,
@@ -44,6 +45,7 @@ from cairn_server.store.row_spool import remove_spools
 from cairn_server.store.store import Store
 from cairn_server.store.store_rows import MapRow, UsedPart
 from cairn_server.sync.admissions import Admissions
+from cairn_server.sync.clock_trust import ClockTrust
 from cairn_server.sync.handing_over import UpstreamProgress
 from cairn_server.sync.held_commits import HeldCommits, WantedCommits
 from cairn_server.sync.pushes import Pushes
@@ -101,10 +103,20 @@ class Service:
         self.reports = RobotReports(store, self.live)
         self.fold_news = FoldNews()
         self._fold_thread: FoldThread | None = None
-        self.site = Site(store, answers=settings.folding != "only", is_folding=self._folds)
+        self.clock = ClockTrust(store)
+        answers = settings.folding != "only"
+        self.site = Site(store, answers=answers, is_folding=self._folds, clock_complaint=self.clock.complaint)
         self.watch: ReplicaWatch | None = None
         if store.replicas is not None:
-            self.watch = ReplicaWatch(store, store.replicas, self.live, self.reports, self.fold_news, self.site)
+            self.watch = ReplicaWatch(
+                store,
+                store.replicas,
+                self.live,
+                self.reports,
+                self.fold_news,
+                self.site,
+                look_at_clock=self.clock.look,
+            )
         self.maps = Maps(store, self.live, self.reports, settings.memory)
         self.maps.warn_of_large_cells()
 
@@ -143,7 +155,7 @@ class Service:
             upstream.wake()
 
         admissions = Admissions(store, settings.quotas)
-        pushes = Pushes(store, settings, self.live, wanted, admissions, on_new=on_new)
+        pushes = Pushes(store, settings, self.live, wanted, admissions, self.clock, on_new=on_new)
         return SyncParts(
             admissions,
             pushes,
@@ -194,7 +206,9 @@ class Service:
         upstream = upstream_metrics(self.sync.upstream.ages_s())
         shares = share_metrics([*self.store.shares.full_sums(), *self._full_authors()])
         memory = memory_metrics(self.settings.memory.limit_bytes)
-        return metrics_text(chain(self.figures.registry.collect(), store, shares, upstream, memory, process_metrics()))
+        clock = clock_metrics(self.clock.doubt_s())
+        counted = self.figures.registry.collect()
+        return metrics_text(chain(counted, store, shares, upstream, memory, clock, process_metrics()))
 
     def stop_streams(self) -> None:
         """Count as not ready and end live streams, which never end alone; requests are still answered for a while."""

@@ -9,6 +9,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 
 from tests.memory_store.admission import admit_registration
+from tests.memory_store.clock import MemoryClock
 from tests.memory_store.figures import MemoryHealth, MemoryNotes, MemoryShares, MemoryUses
 from tests.memory_store.leases import MemoryLeases
 from tests.memory_store.map import new_memory_map
@@ -19,6 +20,7 @@ from tests.memory_store.tokens import MemoryAuditLog, MemoryTokens
 
 from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.ids import Author, CommitId, Incarnation, RobotName
+from cairn_map.epochs.epoch import BASE, Epoch
 from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import CairnError, NotFoundError, UnreachableError
 from cairn_map.evidence.grid import Geometry
@@ -47,6 +49,7 @@ class MemoryStore:
         self.leases = leases
         self.replicas = make_notes(self._maps) if make_notes else None
         self.age = StoreAge(AgeMark(), clocks)
+        self.clock = MemoryClock(clocks, is_shared=make_notes is not None)
         self.tokens = MemoryTokens(self._maps, self.age)
         self.keys = MemoryAdmittedKeys(self._maps)
         self.audit_log = MemoryAuditLog(self._maps)
@@ -92,6 +95,11 @@ class MemoryStore:
         """Maps with evidence of commits folded before an age of the store, by name."""
         with self._maps.locked() as maps:
             return [maps[name].row for name in sorted(maps) if maps[name].has_evidence(before_s)]
+
+    def newest_epoch(self, row: MapRow) -> Epoch:
+        """Newest epoch of the commits of a map; `BASE` if none has one."""
+        with self._maps.reading(row) as state:
+            return max((kept.new.epoch for kept in state.commits.values()), default=BASE)
 
     def append(self, row: MapRow, commit: NewCommit) -> bool:
         """Keep a commit; True if it is new, False if the same one is known already."""

@@ -48,6 +48,8 @@ def checks_of(answers: Sequence[tuple[str, SiteInfo]]) -> Iterator[Check]:
     for site in sites.values():
         yield _servers(site)
         yield _folding(site)
+        if site.clock is not None:
+            yield _trust(site.clock)
         if site.store == "shared":
             yield _clocks(site)
 
@@ -96,6 +98,14 @@ def _folding(site: SiteInfo) -> Check:
     if site.waiting_s > WAITING_WARN_S:
         return Check("folding", CheckResult.WARN, found, "see the log of the servers that fold, and their processors")
     return Check("folding", CheckResult.OK, found)
+
+
+def _trust(complaint: str) -> Check:
+    advice = (
+        "set its clock (NTP, chrony); if it is right as it is, say so: curl -X POST -H 'Authorization: Bearer TOKEN' "
+        "URL/clock (docs/administrator.md)"
+    )
+    return Check("server's clock", CheckResult.WARN, complaint, advice)
 
 
 def _clocks(site: SiteInfo) -> Check:

@@ -86,6 +86,15 @@ class SiteInfo(_Model):
     """Those heard of within the last half minute, this one included, by id."""
     waiting_s: float
     """Seconds for which the oldest commit has waited to be folded; 0: none waits."""
+    clock: str | None = None
+    """Reason why the clock of the store is not trusted, as `code: what`; None, and left out, if it is."""
+
+
+class TrustedTime(_Model):
+    """Answer to `POST /clock`: the time of day that is trusted from here on."""
+
+    time_s: float
+    """UTC seconds since 1970."""
 
 
 class RobotUse(_Model):

@@ -95,7 +95,7 @@ def _middleware(
 ) -> Iterator[Middleware]:
     """Middleware in the order in which a request passes it; the answer passes it in reverse."""
     yield Middleware(DeniedHandshakes)
-    yield Middleware(RequestTrail, figures=service.figures)
+    yield Middleware(RequestTrail, figures=service.figures, time_s=service.clock.now_s)
     if service.settings.admin_token is None:
         yield Middleware(SameOrigin, host=service.settings.host)
     yield Middleware(ProtocolVersion)

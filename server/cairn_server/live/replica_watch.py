@@ -2,6 +2,7 @@
 
     on a hint of a fold  -->  head of that map     -->  Hub.folded
     every second         -->  heads                -->  Hub.folded
+                         -->  clock of the store
                          -->  signs of robots      -->  Hub.present_robots
                          <--  own robots' reports that others cannot see yet
     every ten seconds    <--  sign that this server is alive
@@ -15,6 +16,7 @@ import logging
 import math
 import threading
 import time
+from collections.abc import Callable
 
 from cairn_map.commits.cursor import Cursor
 from cairn_map.errors import CairnError
@@ -50,14 +52,19 @@ class ReplicaWatch:
         news: FoldNews,
         site: Site,
         *,
+        look_at_clock: Callable[[], None] = lambda: None,
         every_s: float = LOOK_EVERY_S,
     ) -> None:
-        """Begin; `notes` are the store's, `news` hears of all folds, and `site` tells of this server."""
+        """Begin; `notes` are the store's, `news` hears of all folds, and `site` tells of this server.
+
+        `look_at_clock` compares the store's clock with this machine's.
+        """
         self._store = store
         self._hub = hub
         self._reports = reports
         self._news = news
         self._site = site
+        self._look_at_clock = look_at_clock
         self._every_s = every_s
         self._seen: dict[int, Cursor] = {}
         """State of each map that listeners were last woken for."""
@@ -95,6 +102,7 @@ class ReplicaWatch:
         Raises:
             CairnError: the store cannot be read now.
         """
+        self._look_at_clock()
         if time.monotonic() >= self._sign_next_s:
             self._sign_next_s = time.monotonic() + SIGN_EVERY_S
             self._site.sign()

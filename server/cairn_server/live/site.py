@@ -25,9 +25,24 @@ ID_LABEL = b"cairn-store-id-1\0"
 class Site:
     """One server among those of its store; called from many threads."""
 
-    def __init__(self, store: Store, *, answers: bool, is_folding: Callable[[], bool]) -> None:
-        """Draw an id; `is_folding` is True while this server folds."""
+    def __init__(
+        self,
+        store: Store,
+        *,
+        answers: bool,
+        is_folding: Callable[[], bool],
+        clock_complaint: Callable[[], str | None] = lambda: None,
+    ) -> None:
+        """Draw an id.
+
+        Args:
+            store: of the servers.
+            answers: False for a server that only folds.
+            is_folding: returns True while this server folds.
+            clock_complaint: returns the reason why the store's clock is not trusted; None if it is.
+        """
         self._store = store
+        self._clock_complaint = clock_complaint
         self._answers = answers
         self._is_folding = is_folding
         self._folded_at_s: float | None = None
@@ -65,6 +80,7 @@ class Site:
             server_id=self.server_id,
             servers=[ServerInfo(**asdict(signs[server])) for server in sorted(signs)],
             waiting_s=max((backlog.waited_s for backlog in self._store.health.backlogs()), default=0.0),
+            clock=self._clock_complaint(),
         )
 
     def _own(self) -> NotedServer:

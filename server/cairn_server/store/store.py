@@ -14,6 +14,7 @@ from typing import Protocol
 from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.ids import Author, CommitId, Incarnation
 from cairn_map.commits.version_vector import VersionVector
+from cairn_map.epochs.epoch import Epoch
 from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import ConflictError
 from cairn_map.evidence.fingerprint import Fingerprint
@@ -24,6 +25,7 @@ from cairn_map.wire.messages import LogEntry
 from cairn_server.store.admission import OWN_WORD, Grounds, RobotKey
 from cairn_server.store.replica_notes import ReplicaNotes
 from cairn_server.store.store_age import StoreAge
+from cairn_server.store.store_clock import StoreClock
 from cairn_server.store.store_rows import (
     Backlog,
     Branch,
@@ -395,6 +397,11 @@ class Store(Protocol):
         ...
 
     @property
+    def clock(self) -> StoreClock:
+        """Clock of the store: the time of day by which epochs are judged."""
+        ...
+
+    @property
     def shares(self) -> Shares:
         """Accounts of robots."""
         ...
@@ -444,6 +451,10 @@ class Store(Protocol):
 
     def heads(self, numbers: Collection[int] | None = None) -> list[tuple[MapRow, Cursor]]:
         """All maps, or those of these numbers that there are, with their present states, by name; in one query."""
+        ...
+
+    def newest_epoch(self, row: MapRow) -> Epoch:
+        """Newest epoch of the commits of a map, folded or not; `BASE` if none has one."""
         ...
 
     def waiting_maps(self) -> list[MapRow]:

@@ -14,6 +14,8 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from cairn_map.machine_clocks import MACHINE_CLOCKS
+
 JUMP_S = 60.0
 """Difference between the two clocks from one look to the next above which the wall clock jumped: NTP moves a clock that
 it does not set by 5 s a minute at most."""
@@ -30,13 +32,22 @@ class AgeMark:
 
 @dataclass(frozen=True, slots=True)
 class Clocks:
-    """The machine's two clocks, each a function that returns seconds."""
+    """The machine's clocks, each a function that returns seconds."""
 
     wall_s: Callable[[], float] = time.time
     steady_s: Callable[[], float] = time.monotonic
+    """Of ages: it stands still while the machine sleeps."""
+    sleepless_s: Callable[[], float] | None = None
+    """Of trust in the time of day: as steady, and counts on while the machine sleeps; None: that of ages does."""
+    boot: str = ""
+    """Boot of the machine with which the sleepless clock began; empty: unknown."""
+
+    def since_boot_s(self) -> float:
+        """The sleepless clock."""
+        return (self.sleepless_s or self.steady_s)()
 
 
-CLOCKS = Clocks()
+CLOCKS = Clocks(sleepless_s=MACHINE_CLOCKS.steady_s, boot=MACHINE_CLOCKS.boot)
 
 
 class StoreAge:

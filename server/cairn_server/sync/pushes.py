@@ -6,7 +6,7 @@ Only what is durable and fully validated is acknowledged. All of it is synchrono
 from collections.abc import Callable
 from dataclasses import replace
 
-from cairn_map.commits.commit import Commit
+from cairn_map.commits.commit import Commit, CommitMeta
 from cairn_map.commits.commit_reading import CommitReader, commit_reader
 from cairn_map.commits.ids import Author
 from cairn_map.commits.signature import (
@@ -16,7 +16,7 @@ from cairn_map.commits.signature import (
     signatures_from_text,
     signatures_to_text,
 )
-from cairn_map.errors import ConflictError, DeniedError
+from cairn_map.errors import ConflictError, DeniedError, UnreachableError
 from cairn_server.access.auth import UPSTREAM, Caller, Role
 from cairn_server.access.quotas import Meter
 from cairn_server.access.rate_limits import AuditLimit
@@ -30,6 +30,7 @@ from cairn_server.sync.admissions import Admissions
 from cairn_server.sync.checks.checking import new_commit
 from cairn_server.sync.checks.commit_checks import CommitChecks
 from cairn_server.sync.checks.push_policy import check_claims
+from cairn_server.sync.clock_trust import ClockTrust
 from cairn_server.sync.handing_over import speaker_of
 from cairn_server.sync.held_commits import WantedCommits
 from cairn_server.sync.retracting import is_sealed
@@ -45,6 +46,7 @@ class Pushes:
         hub: Hub,
         wanted: WantedCommits,
         admissions: Admissions,
+        clock: ClockTrust,
         *,
         on_new: Callable[[], None],
     ) -> None:
@@ -56,6 +58,7 @@ class Pushes:
         self._hub = hub
         self._wanted = wanted
         self._admissions = admissions
+        self._clock = clock
         self._on_new = on_new
         self._audit_limit = AuditLimit()
 
@@ -76,7 +79,7 @@ class Pushes:
         Raises:
             DamagedDataError: the bytes are no sound commit.
             BadInputError: not a commit for this map, not by this caller, or against `push_policy` or `quotas`.
-            UnreachableError: kind `quota`: more than the robot may push now; or `disk_full`.
+            UnreachableError: kind `quota`: more than the robot may push now; `disk_full`; or `bad_clock`.
             DeniedError: kind `not_admitted`: its author's name is bound to another key (`store.admission`).
             ConflictError: kind `id_taken`: the id is known with other bytes; or `evidence_gone`: the commits that it
                 retracts are wanted from now on.
@@ -89,6 +92,7 @@ class Pushes:
         signed = signatures_from_text(signatures) if signatures else ()
         speaker = self._speaker(row, caller, commit, signed, seal)
         check_claims(row, speaker, id_text, commit.meta, cells=len(commit.cells))
+        self._check_time(row, commit.meta)
         via = caller.name if speaker is not caller and caller.role is Role.RELAY else None
 
         # The quota is taken while the commit is checked and written, and given back unless it is new.
@@ -107,6 +111,7 @@ class Pushes:
         # Durable from here on: tell those that wait for it.
         self._wanted.forget(row.name, commit.meta.commit_id)
         if is_new:
+            self._clock.note_push(row, commit.meta.row)
             self._on_new()
         if caller.robot:
             self._store.seen(row, caller.robot, None)
@@ -141,6 +146,19 @@ class Pushes:
         if is_sealed(row, commit.data, seal):
             return Caller(Role.ADMIN)
         return speaker_of(row, caller, commit.meta, signed, self._settings.trusted_servers)
+
+    def _check_time(self, row: MapRow, meta: CommitMeta) -> None:
+        """Refuse a commit from the future, except one that is here already.
+
+        Raises:
+            UnreachableError: kind `bad_clock`.
+        """
+        commit = meta.commit_id
+        try:
+            self._clock.check_push(row, commit.author, meta.row)
+        except UnreachableError:
+            if self._store.kept_sha(row, commit) is None:
+                raise
 
     def _checked(self, row: MapRow, commit: CommitReader, signed: tuple[Signature, ...], caller: Caller) -> NewCommit:
         """Decode the evidence and check all of it, and the signatures over it.

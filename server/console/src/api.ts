@@ -1,7 +1,7 @@
 /** Requests to the one server that this page came from, with the token that the operator gave. */
 
 import type { CellEntry, CellIndex, Triple } from "./messages.ts";
-import { noteServerDate } from "./server_time.ts";
+import { noteServerDate, noteTrust } from "./server_time.ts";
 
 const TOKEN_KEY = "cairn.token";
 const INDEX_PAGE = 10_000;
@@ -116,6 +116,7 @@ export class Api {
       throw new ApiError(0, "unreachable", "The server does not answer. The page goes on by itself when it does.");
     }
     noteServerDate(answer.headers.get("Date"));
+    if (answer.ok) noteTrust(answer.headers.get("Cairn-Time"));
     if (answer.ok || answer.status === 304) return answer;
     const problem = (await answer.json().catch(() => ({}))) as { kind?: string; detail?: string };
     throw new ApiError(answer.status, problem.kind ?? "unknown", problem.detail ?? answer.statusText);

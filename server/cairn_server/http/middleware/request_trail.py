@@ -1,4 +1,4 @@
-"""Trail of every request: an id, a line in the log, and counts. Plain ASGI, around everything else.
+"""Trail of every request: an id, the server's time, a line in the log, and counts. Plain ASGI, around everything else.
 
 The id is the caller's own `X-Request-Id` if it is a sensible one, else a new one; the answer has it, and so has every
 line that is logged meanwhile.
@@ -9,7 +9,7 @@ import logging
 import random
 import re
 import time
-from collections.abc import MutableMapping
+from collections.abc import Callable, MutableMapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +20,8 @@ from cairn_server.metrics import ServerFigures
 log = logging.getLogger(__name__)
 
 HEADER = b"x-request-id"
+TIME_HEADER = b"cairn-time"
+"""UTC seconds since 1970 at the beginning of an answer, by which robots learn the lead of the server's clock."""
 SENSIBLE = re.compile(rb"[A-Za-z0-9._-]{1,64}")
 METHODS = frozenset({"GET", "PUT", "POST", "DELETE", "HEAD", "OPTIONS", "PATCH"})
 PUSH = "/maps/{name}/commits/{commit}"
@@ -43,15 +45,19 @@ class Trail:
 class RequestTrail:
     """Middleware that counts and logs each request once it is answered."""
 
-    def __init__(self, app: App, *, figures: ServerFigures) -> None:
+    def __init__(self, app: App, *, figures: ServerFigures, time_s: Callable[[], float | None]) -> None:
+        """`time_s` returns the server's time; None while its clock is not trusted."""
         self._app = app
         self._figures = figures
+        self._time_s = time_s
 
     async def __call__(self, scope: MutableMapping[str, Any], receive: Receive, send: Send) -> None:
         """Pass a request on, and count what comes and goes."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
+        # A jump is noticed before anything is done for this request.
+        self._time_s()
         trail, start_s = Trail(), time.perf_counter()
         request_id = _request_id(scope["headers"])
         reset = REQUEST_ID.set(request_id)
@@ -66,7 +72,11 @@ class RequestTrail:
                 trail.status = message["status"]
                 headers = list(message.get("headers", ()))
                 trail.is_problem = (b"content-type", b"application/problem+json") in headers
-                message = {**message, "headers": [*headers, (HEADER, request_id.encode())]}
+                headers.append((HEADER, request_id.encode()))
+                now_s = self._time_s()
+                if now_s is not None:
+                    headers.append((TIME_HEADER, b"%.3f" % now_s))
+                message = {**message, "headers": headers}
             elif message["type"] == "http.response.body":
                 body = message.get("body", b"")
                 trail.sent_bytes += len(body)

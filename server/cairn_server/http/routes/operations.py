@@ -6,7 +6,7 @@ from fastapi import APIRouter, Depends, Query
 from fastapi.responses import PlainTextResponse
 
 from cairn_map.errors import UnreachableError
-from cairn_map.wire.access_messages import AuditEntry, CreateToken, NewSecret, SiteInfo, TokenInfo
+from cairn_map.wire.access_messages import AuditEntry, CreateToken, NewSecret, SiteInfo, TokenInfo, TrustedTime
 from cairn_server.access.auth import Caller
 from cairn_server.access.tokens import confirm_token, create_token, list_tokens, revoke_token, rotate_token
 from cairn_server.http.routes.callers import ADMIN, Asking, Operations, admin, reader_somewhere
@@ -37,9 +37,13 @@ def metrics_reader(asker: Asking) -> None:
 
 @router.get("/readyz")
 def readyz(service: Operations) -> dict[str, str]:
-    """The server can take a push and bring it into the map; else 503 says why not."""
+    """The server can take a push and bring it into the map; else 503 says why not.
+
+    A clock that is not trusted takes no server out of service: what it hands out and takes is less, and right.
+    """
     service.readiness.check()
-    return {"status": "ready"}
+    complaint = service.clock.complaint()
+    return {"status": "ready"} | ({"degraded": complaint} if complaint else {})
 
 
 @router.get("/metrics", response_class=PlainTextResponse, dependencies=[Depends(metrics_reader)])
@@ -48,7 +52,13 @@ def metrics(service: Operations) -> PlainTextResponse:
     return PlainTextResponse(service.metrics_text(), media_type=MEDIA_TYPE)
 
 
-@router.get("/servers", dependencies=[Depends(reader_somewhere)])
+@router.post("/clock", responses=problems(409))
+def trust_clock(service: Operations, caller: Admin) -> TrustedTime:
+    """Trust the time of day as it is now."""
+    return TrustedTime(time_s=service.clock.trust(by=caller.name))
+
+
+@router.get("/servers", dependencies=[Depends(reader_somewhere)], response_model_exclude_defaults=True)
 def get_servers(service: Operations) -> SiteInfo:
     """Servers of this one's store that are alive."""
     return service.site.info()

@@ -32,6 +32,7 @@ STATUS_OF_KIND = {
     "too_large": 413,
     "other_log": 410,
     "quota": 429,
+    "bad_clock": 425,
     "damaged_store": 500,
     "disk_full": 507,
     "bad_range": 416,

@@ -38,7 +38,7 @@ router = APIRouter()
 
 @router.put(
     "/maps/{name}/commits/{commit}",
-    responses=also(201, PushReceipt) | problems(409, 429, 507),
+    responses=also(201, PushReceipt) | problems(409, 425, 429, 507),
     openapi_extra=body(COMMIT_MEDIA_TYPE) | TAKES_TOKEN,
 )
 def push(
@@ -121,7 +121,7 @@ def upload(
 
 @router.patch(
     UPLOAD,
-    responses=also(201, Upload) | problems(409, 429, 507),
+    responses=also(201, Upload) | problems(409, 425, 429, 507),
     openapi_extra=body("application/octet-stream"),
 )
 async def add_part(

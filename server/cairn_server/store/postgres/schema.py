@@ -360,6 +360,10 @@ ALTER TABLE server ADD COLUMN step bigint;          -- newest one that its progr
 """
 EPOCHS_OLDEST = 6
 """Oldest step whose programs work on a store with a map with epochs."""
+CLOCK = """
+ALTER TABLE age ADD COLUMN clock text;              -- `store_clock.ClockMark`, as JSON
+CREATE INDEX commits_epoch ON commits (map, epoch) WHERE epoch IS NOT NULL;
+"""
 BOUND_OLDEST = 4
 """Oldest step whose programs read a store of which bytes are in an object store."""
 
@@ -373,7 +377,7 @@ class Step:
     """Number of the oldest step whose programs work on a database that took this one."""
 
 
-STEPS = tuple(Step(sql, oldest=1) for sql in (FIRST, REPLICAS, SERVERS, OBJECTS, OWNED_OBJECTS, EPOCHS))
+STEPS = tuple(Step(sql, oldest=1) for sql in (FIRST, REPLICAS, SERVERS, OBJECTS, OWNED_OBJECTS, EPOCHS, CLOCK))
 
 
 def prepare(url: str, *, has_objects: bool = False) -> None:

@@ -10,6 +10,7 @@ from functools import partial
 
 from cairn_map.commits.cursor import Cursor, first_chain
 from cairn_map.commits.ids import Author
+from cairn_map.epochs.epoch import BASE, Epoch
 from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import ConflictError, NotFoundError, UnreachableError
 from cairn_map.evidence.fingerprint import ZERO
@@ -26,13 +27,14 @@ from cairn_server.store.postgres.reads import PgReads
 from cairn_server.store.postgres.replica_notes import PgReplicaNotes
 from cairn_server.store.postgres.retention import forget_evidence
 from cairn_server.store.postgres.robot_keys import PgAdmittedKeys
-from cairn_server.store.postgres.schema import EPOCHS_OLDEST, prepare
+from cairn_server.store.postgres.schema import EPOCHS_OLDEST, NOW_S, prepare
 from cairn_server.store.postgres.shares import PgShares
 from cairn_server.store.postgres.tokens import PgAuditLog, PgTokens
 from cairn_server.store.postgres.writing_threads import WritingThreads
 from cairn_server.store.replica_notes import SERVER_S
 from cairn_server.store.store import check_same_map
 from cairn_server.store.store_age import CLOCKS, AgeMark, Clocks, StoreAge
+from cairn_server.store.store_clock import ClockMark, clock_mark_from_text
 from cairn_server.store.store_rows import Branch, Fold, MapRow, NewCommit
 
 log = logging.getLogger(__name__)
@@ -48,6 +50,7 @@ RETURNING age_s, wall_s
 """
 """The age of the store goes on by the time since any server ticked last, by the database's clock: so all servers have
 one age. Time in which none ran does not count, nor does a jump of that clock: each ticks every 60 s."""
+NOW = f"SELECT {NOW_S}"
 NUMBER_BITS = 52
 """Bits of a map's number: exact in any program that reads numbers as floats."""
 CONNECTIONS = 48
@@ -56,6 +59,37 @@ NAMES_S = 1.0
 """Time for which a map's name is not looked up again: in a database that was put back it may be another map's."""
 NOTING_CONNECTIONS = 12
 """Most besides for what need not be durable at once."""
+
+
+class PgClock:
+    """`store_clock.StoreClock`: the time of day is the database's, for all its servers."""
+
+    boot = ""
+
+    def __init__(self, noting: Connections, threads: WritingThreads, clocks: Clocks) -> None:
+        self._noting = noting
+        self._threads = threads
+        self._clocks = clocks
+
+    def steady_s(self) -> float:
+        """The machine's steady clock."""
+        return self._clocks.since_boot_s()
+
+    def wall_s(self) -> float:
+        """The database's time of day."""
+        with self._noting.lent() as connection:
+            return float(first(connection, NOW))
+
+    def kept(self) -> ClockMark:
+        """State that any server kept last."""
+        with self._noting.lent() as connection:
+            return clock_mark_from_text(first(connection, "SELECT clock FROM age"))
+
+    def keep(self, mark: ClockMark, *, before: ClockMark) -> None:
+        """Keep a state, unless another server kept one since."""
+        query = "UPDATE age SET clock = %s WHERE coalesce(clock, %s) = %s"
+        values = (mark.to_text(), ClockMark().to_text(), before.to_text())
+        self._threads.note(lambda connection: connection.execute(query, values))
 
 
 class PgStore(PgReads):
@@ -88,6 +122,7 @@ class PgStore(PgReads):
         self._threads = WritingThreads(self._noting)
         with self._connections.lent() as connection:
             self.age = StoreAge(AgeMark(*first(connection, TICK, {"own_s": 0.0})), clocks)
+        self.clock = PgClock(self._noting, self._threads, clocks)
         self.tokens = PgTokens(self._connections, self._threads, self.age)
         self.keys = PgAdmittedKeys(self._connections)
         self.uses = PgUses(self._connections)
@@ -145,6 +180,13 @@ class PgStore(PgReads):
             self._names[name] = found[0], now_s + NAMES_S
             return found[0]
         raise NotFoundError("no_map", f"there is no map {name!r}; `cairn map ls` lists them")
+
+    def newest_epoch(self, row: MapRow) -> Epoch:
+        """Newest epoch of the commits of a map; `BASE` if none has one."""
+        with self._connections.lent() as connection:
+            query = "SELECT max(epoch) FROM commits WHERE map = %s AND epoch IS NOT NULL"
+            newest = first(connection, query, (row.number,))
+        return BASE if newest is None else Epoch(newest)
 
     def append(self, row: MapRow, commit: NewCommit) -> bool:
         """Keep a commit; True if it is new, False if the same one is kept already. Durable on return."""

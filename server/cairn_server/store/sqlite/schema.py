@@ -304,6 +304,11 @@ CREATE INDEX cell_listed
     ON cell (map, cell, lm, digest, fingerprint, voxels, size_bytes, gone_seq, hottest_k, history_bytes);
 """
 
+CLOCK = """
+ALTER TABLE age ADD COLUMN clock TEXT;              -- `store_clock.ClockMark`, as JSON
+CREATE INDEX commits_epoch ON commits (map, epoch) WHERE epoch IS NOT NULL;
+"""
+
 STEPS = (
     FIRST,
     STAMPS,
@@ -321,6 +326,7 @@ STEPS = (
     DUE,
     TILES,
     EPOCHS,
+    CLOCK,
 )
 
 

@@ -15,6 +15,7 @@ import apsw
 
 from cairn_map.commits.cursor import Cursor, first_chain
 from cairn_map.commits.ids import Author, Incarnation, RobotName, new_incarnation
+from cairn_map.epochs.epoch import BASE, Epoch
 from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import BadInputError, NotFoundError, UnreachableError
 from cairn_map.evidence.grid import Geometry
@@ -44,6 +45,7 @@ from cairn_server.store.sqlite.tokens import (
 from cairn_server.store.sqlite.writer import Writer, connect, first, rows
 from cairn_server.store.store import check_same_map
 from cairn_server.store.store_age import CLOCKS, AgeMark, Clocks, StoreAge
+from cairn_server.store.store_clock import ClockMark, clock_mark_from_text
 from cairn_server.store.store_rows import (
     Backlog,
     Branch,
@@ -67,6 +69,40 @@ MAPS_MAX = 1000
 log = logging.getLogger(__name__)
 
 FILE_NAME = "cairn.sqlite"
+NEWEST = "SELECT max(epoch) FROM commits WHERE map = ? AND epoch IS NOT NULL"
+"""SQL of the newest epoch of a map's commits."""
+
+
+class SqliteClock:
+    """`store_clock.StoreClock` of the one machine that has the store."""
+
+    def __init__(self, writer: Writer, clocks: Clocks, kept: ClockMark) -> None:
+        self._writer = writer
+        self._clocks = clocks
+        self._kept = kept
+
+    @property
+    def boot(self) -> str:
+        """Boot of the machine."""
+        return self._clocks.boot
+
+    def steady_s(self) -> float:
+        """The machine's steady clock."""
+        return self._clocks.since_boot_s()
+
+    def wall_s(self) -> float:
+        """The machine's time of day."""
+        return self._clocks.wall_s()
+
+    def kept(self) -> ClockMark:
+        """State that was kept last."""
+        return self._kept
+
+    def keep(self, mark: ClockMark, *, before: ClockMark) -> None:
+        """Keep a state; no other server keeps any."""
+        self._kept = mark
+        with suppress(UnreachableError):  # a later one is kept soon
+            self._writer.submit(lambda connection: rows(connection, "UPDATE age SET clock = ?", (mark.to_text(),)))
 
 
 class SqliteStore(SqliteReads):
@@ -97,7 +133,9 @@ class SqliteStore(SqliteReads):
         super().__init__(Readers(path))
         self._seen = LastSeen()
         with self._readers.reading() as reader:
-            self.age = StoreAge(AgeMark(*first(reader, "SELECT age_s, wall_s FROM age")), clocks)
+            age_s, wall_s, mark = first(reader, "SELECT age_s, wall_s, clock FROM age")
+        self.age = StoreAge(AgeMark(age_s, wall_s), clocks)
+        self.clock = SqliteClock(self._writer, clocks, clock_mark_from_text(mark))
         self.tokens = SqliteTokens(self._writer, self._readers, self.age, self._ended)
         self.keys = SqliteAdmittedKeys(self._writer, self._readers)
         self.uses = SqliteUses(self._readers)
@@ -150,6 +188,12 @@ class SqliteStore(SqliteReads):
             self._names[name] = found[0]
             return found[0]
         raise NotFoundError("no_map", f"there is no map {name!r}; `cairn map ls` lists them")
+
+    def newest_epoch(self, row: MapRow) -> Epoch:
+        """Newest epoch of the commits of a map; `BASE` if none has one."""
+        with self._readers.reading() as reader:
+            newest = first(reader, NEWEST, (row.number,))
+        return BASE if newest is None else Epoch(newest)
 
     def append(self, row: MapRow, commit: NewCommit) -> bool:
         """Keep a commit; True if it is new, False if the same one is kept already. Durable on return."""

@@ -4,6 +4,9 @@ Evidence is refused before it can spoil a map: counts that no scan could give wo
 and use up the range of the sums for everybody; ids full of gaps would grow every version vector without bound.
 """
 
+import math
+from datetime import UTC, datetime
+
 import numpy as np
 import numpy.typing as npt
 
@@ -11,7 +14,8 @@ from cairn_map.codec.cell_code import CanonicalCell
 from cairn_map.codec.octree.cell_content import CellContent
 from cairn_map.commits.commit import CommitMeta
 from cairn_map.commits.ids import INITIAL
-from cairn_map.errors import BadInputError, DamagedDataError, DeniedError
+from cairn_map.epochs.epoch import Epoch, begin_s, epoch_of
+from cairn_map.errors import BadInputError, DamagedDataError, DeniedError, UnreachableError
 from cairn_map.evidence.channels import SAMPLE_MAX, planes_and_squares
 from cairn_map.evidence.evidence_kernels import bounds_of_counts, channel_above
 from cairn_map.evidence.grid import Geometry, cell_of_key
@@ -21,6 +25,8 @@ from cairn_server.store.store_rows import MapRow
 MAIN = "main"
 TIME_MAX_S = 1e11
 """As of a status. Ages are shown from the newest time: one that is infinite would make all others so."""
+AGAIN_MAX_S = 3600.0
+"""Longest time after which a commit from the future is tried again: the clock that is wrong may be this one."""
 
 
 def check_claims(row: MapRow, caller: Caller, id_text: str, meta: CommitMeta, *, cells: int) -> None:
@@ -48,6 +54,30 @@ def check_claims(row: MapRow, caller: Caller, id_text: str, meta: CommitMeta, *,
         raise BadInputError("bad_commit", f"a time of the commit is beyond {TIME_MAX_S:g} s since 1970")
     if not cells and not meta.retracts:
         raise DamagedDataError("empty_commit", "a commit must hold evidence or name commits to retract")
+
+
+def check_epoch(epoch: Epoch, epoch_s: int, *, now_s: float) -> None:
+    """Refuse a commit from the future, whoever brings it: it would outrank all others until its time has come.
+
+    The epoch after the present one is taken: clocks differ, and that costs no more than a delay.
+
+    Args:
+        epoch: of the commit.
+        epoch_s: length of the map's epochs, seconds.
+        now_s: time of day, UTC seconds since 1970.
+
+    Raises:
+        UnreachableError: kind `bad_clock`: to be tried again when its time has come.
+    """
+    if epoch <= epoch_of(now_s, epoch_s) + 1:
+        return
+    wait_s = begin_s(Epoch(epoch - 1), epoch_s) - now_s
+    now = datetime.fromtimestamp(now_s, UTC).isoformat(timespec="seconds")
+    raise UnreachableError(
+        "bad_clock",
+        f"the commit's measurement is {wait_s + epoch_s:.0f} s in the future: the server's time is {now_s:.3f} ({now})",
+        retry_after_s=math.ceil(min(wait_s, AGAIN_MAX_S)),
+    )
 
 
 def check_evidence(meta: CommitMeta, cell: CanonicalCell, tops: npt.NDArray[np.int64]) -> None:

@@ -4,6 +4,7 @@ import { fill, h } from "../dom.ts";
 import type { LinkState } from "../live.ts";
 import { FIELDS, type Field } from "../look.ts";
 import type { MapInfo } from "../messages.ts";
+import { isClockTrusted } from "../server_time.ts";
 import { ago } from "../units.ts";
 
 const THEME_KEY = "cairn.theme";
@@ -48,6 +49,7 @@ export class TopBar {
     const age = heardMs === null ? null : (Date.now() - heardMs) / 1000;
     const [state, said] =
       error !== null && live ? ["late", `Trouble: ${error}`]
+      : live && !isClockTrusted() ? ["late", "Live; the server's clock is not trusted: measurements may wait"]
       : live ? (waiting > 0 ? ["busy", `Live, loading ${waiting} cells`] : ["live", "Live"])
       : age === null ? ["lost", "Connecting …"]
       : ["lost", `No link: the map is as it was ${ago(age)}`];
