@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping
 from typing import Protocol
 
 from cairn_client.http.request_deadline import RequestDeadline
-from cairn_client.sync.responses import Traffic
+from cairn_client.sync.responses import TimeSample, Traffic
 from cairn_map.errors import BadInputError, DamagedDataError
 
 CODING = "identity"
@@ -24,6 +24,8 @@ ERROR_BYTES_MAX = 1 << 16
 HEADER_TEXT = re.compile(r"[!-~](?:[ -~]*[!-~])?")
 """Text that may stand in a header: visible ASCII, with spaces between."""
 HEADER_LENGTH_MAX = 4096
+SECONDS = re.compile(r"[0-9]{1,11}(\.[0-9]{1,9})?")
+"""UTC seconds since 1970, to the year 5138."""
 
 
 class RawResponse(Protocol):
@@ -81,6 +83,20 @@ def parts_of(
 def body_of_error(response: RawResponse) -> bytes:
     """Beginning of an error's body; empty if it is encoded: the status alone counts then."""
     return b"" if coding_of(response) else next(response.iter_raw(ERROR_BYTES_MAX), b"")[:ERROR_BYTES_MAX]
+
+
+def time_sample(headers: Mapping[str, str], *, asked_s: float, answered_s: float) -> TimeSample | None:
+    """The server's time in an answer's header `Cairn-Time`; None if it says none, or a cache may have kept the answer.
+
+    Args:
+        headers: of the answer.
+        asked_s: steady time before the request was sent.
+        answered_s: steady time after the headers of the answer came.
+    """
+    text = headers.get("Cairn-Time", "")
+    if "Age" in headers or not SECONDS.fullmatch(text):
+        return None
+    return TimeSample(float(text), (asked_s + answered_s) / 2, (answered_s - asked_s) / 2)
 
 
 def sent_again(headers: Mapping[str, str], name: str) -> str:

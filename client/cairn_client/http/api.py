@@ -9,7 +9,7 @@ import contextlib
 import socket
 import threading
 import weakref
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
@@ -17,11 +17,20 @@ from typing import TYPE_CHECKING, Any, Self
 
 from pydantic import TypeAdapter, ValidationError
 
-from cairn_client.http.answer_reading import CODING, body_of_error, header_text, parts_of, sent_again
+from cairn_client.http.answer_reading import CODING, body_of_error, header_text, parts_of, sent_again, time_sample
 from cairn_client.http.origin_tokens import without_token
 from cairn_client.http.request_deadline import PACE, Pace, RequestDeadline
 from cairn_client.sync.requests import Box, GetUpload, PutPart
-from cairn_client.sync.responses import Answer, FetchedCell, Traffic, error_of, list_of, unreachable
+from cairn_client.sync.responses import (
+    Answer,
+    FetchedCell,
+    TimeSample,
+    Traffic,
+    error_of,
+    list_of,
+    narrower,
+    unreachable,
+)
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.cursor import cursor_from_text
 from cairn_map.commits.ids import Author, CommitId
@@ -29,6 +38,7 @@ from cairn_map.commits.version_vector import EMPTY, VersionVector, vector_digest
 from cairn_map.errors import BadInputError, CairnError, DamagedDataError, UnreachableError, first_error
 from cairn_map.evidence.fingerprint import fingerprint_from_hex
 from cairn_map.evidence.grid import Cell
+from cairn_map.machine_clocks import MACHINE_CLOCKS
 from cairn_map.wire.access_messages import (
     Challenge,
     CreateToken,
@@ -77,6 +87,8 @@ FORMAT_VERSION = "2"
 """Newest version of cells and commits that is read; without it a server takes a client for one of version 1."""
 TIMEOUT_S, CONNECT_S = 30.0, 5.0
 NO_CONTENT, NOT_MODIFIED = 204, 304
+CACHED = ("GET", "HEAD")
+"""Methods whose answers may come from a cache, and say a time of long ago."""
 ANSWER_BYTES_MAX = 64 << 20
 """Longest whole answer that is read."""
 REPLY_BYTES_MAX = (1 << 26) + FRAME_BYTES_MAX + JSON_BYTES_MAX
@@ -152,9 +164,18 @@ class MapApi:
     """
 
     def __init__(
-        self, server_url: str, *, token: str | None = None, ca_file: Path | None = None, pace: Pace = PACE
+        self,
+        server_url: str,
+        *,
+        token: str | None = None,
+        ca_file: Path | None = None,
+        pace: Pace = PACE,
+        steady_s: Callable[[], float] = MACHINE_CLOCKS.steady_s,
     ) -> None:
         self._pace = pace
+        self._steady_s = steady_s
+        self._time: TimeSample | None = None
+        """The best that the server's answers said of its time since that was taken."""
         self.traffic = Traffic()
         self.sockets = OpenSockets()
         self._vector = EMPTY
@@ -189,6 +210,11 @@ class MapApi:
             BadInputError: kind `bad_header`: no token has such characters.
         """
         self.token = header_text(token, "a token") if token else None
+
+    def take_time(self) -> TimeSample | None:
+        """The server's time in the quickest of its answers since the last call; None if none said it."""
+        taken, self._time = self._time, None
+        return taken
 
     def close(self) -> None:
         """Close the connections."""
@@ -462,12 +488,16 @@ class MapApi:
         for field, text in sent.items():
             header_text(text, field)
         deadline = RequestDeadline(self._pace, self.sockets.break_off, sent_bytes=len(content))
+        asked_s = self._steady_s()
         try:
             with (
                 deadline,
                 self._client.stream(method, path, headers=sent, content=content, params=params) as response,
             ):
                 self.traffic.up_bytes += len(content)
+                if method not in CACHED:
+                    found = time_sample(response.headers, asked_s=asked_s, answered_s=self._steady_s())
+                    self._time = narrower(self._time, found)
                 if not response.is_success and response.status_code != NOT_MODIFIED:
                     retry_after = response.headers.get("Retry-After", "")
                     error = error_of(response.status_code, retry_after, body_of_error(response))

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from itertools import islice
 
+from cairn_client.replica.replica import BAD_CLOCK
 from cairn_client.sync.requests import Ask, Conversation
 from cairn_client.sync.uploads import CAME_IN_PART
 from cairn_map.commits.commit import split_commit
@@ -73,11 +74,15 @@ class Why(Enum):
     """The source does not keep its bytes any more."""
     UNSIGNED = "unsigned"
     REFUSED = "refused"
+    EARLY = "early"
+    """The target does not trust its time, or it is still to come there (`bad_clock`): later."""
     BROKEN = "broken"
     """The link broke at it twice before any part of it came, or the server could not take it, though both places had
     just answered."""
 
 
+FOR_A_WHILE = (Why.REFUSED, Why.EARLY, Why.BROKEN)
+"""Reasons for which it is not tried again before all others were, and `rest_s` has passed."""
 FOR_GOOD = (Why.GONE, Why.UNSIGNED)
 """Reasons for which a commit is not requested again while its source still names it."""
 
@@ -124,7 +129,7 @@ class Undelivered:
 
     def may_come_later(self, to: RelaySide) -> bool:
         """True if this side lacks commits that it might take once the link or the server is better."""
-        return self.pauses(to) or bool(self._found[to, Why.BROKEN].intervals)
+        return self.pauses(to) or any(self._found[to, why].intervals for why in (Why.EARLY, Why.BROKEN))
 
     def lacking(self, source: Held, target: Held, to: RelaySide) -> Iterator[CommitId]:
         """Commits that the source could give and that are worth a try, each author's oldest first."""
@@ -132,7 +137,7 @@ class Undelivered:
         for why in FOR_GOOD:  # of these, what the source still names: if it was replaced, it may have them again
             self._found[to, why] = known = lacking.minus(lacking.minus(self._found[to, why]))
             lacking = lacking.minus(known)
-        tried = [self._found[to, why] for why in (Why.REFUSED, Why.BROKEN)]
+        tried = [self._found[to, why] for why in FOR_A_WHILE]
         for known in tried:
             lacking = lacking.minus(known)
         yield from lacking
@@ -148,7 +153,7 @@ class Undelivered:
             return
         del self._until_s[to]
         report.has_more |= self.may_come_later(to)
-        self._found[to, Why.REFUSED] = self._found[to, Why.BROKEN] = EMPTY
+        self._found |= {(to, why): EMPTY for why in FOR_A_WHILE}
         report.kept_back |= {(to, why): self._found[to, why] for why in FOR_GOOD if self._found[to, why].intervals}
 
 
@@ -161,6 +166,8 @@ class RelayReport:
     kept_back: dict[tuple[RelaySide, Why], VersionVector] = field(default_factory=dict)
     """Commits that a side lacks for good, gone or unsigned: only the new ones, and now and then all."""
     refused: list[tuple[CommitId, CairnError]] = field(default_factory=list)
+    early: list[tuple[CommitId, CairnError]] = field(default_factory=list)
+    """Commits that a side does not take yet, since their time is to come there or cannot be judged."""
     split: list[Author] = field(default_factory=list)
     """Authors of whom the two sides have other bytes under the same ids."""
     later: UnreachableError | None = None
@@ -227,14 +234,17 @@ def _hand_over(
     for commit_id in islice(lacking, AT_ONCE):
         try:
             why = yield from _move(source, target, commit_id)
-        # A break ends this direction; a refusal, like a commit that is gone, lets the next one go by.
+        # A break ends this direction; a refusal, like a commit that is gone or early, lets the next one go by.
         except UnreachableError as exc:
-            resting.broke(target, commit_id, exc)
-            if exc.retry_after_s:
-                report.later = exc
-            else:
-                report.cut = exc
-            return
+            if exc.kind != BAD_CLOCK:
+                resting.broke(target, commit_id, exc)
+                if exc.retry_after_s:
+                    report.later = exc
+                else:
+                    report.cut = exc
+                return
+            report.early.append((commit_id, exc))
+            why = Why.EARLY
         except CairnError as exc:
             if isinstance(exc, DeniedError) and exc.kind not in ("not_allowed", "not_admitted"):
                 raise
@@ -316,6 +326,9 @@ def log_report(report: RelayReport, map_name: str, *, there: str) -> None:
     if report.refused:
         commit, error = report.refused[0]
         log.error("map %s: %d commits refused, such as %s: %s", map_name, len(report.refused), commit, error.message)
+    if report.early:
+        commit, error = report.early[0]
+        log.warning("map %s: %d commits wait, such as %s: %s", map_name, len(report.early), commit, error.message)
     if report.split:
         log.error(
             "map %s: the two servers have other commits under the same ids, of %s: such a robot's disk was rolled "

@@ -34,7 +34,7 @@ from cairn_map.commits.version_vector import EMPTY
 from cairn_map.epochs.cell_history import CellHistory
 from cairn_map.epochs.history_map import HistoryMap
 from cairn_map.epochs.layer import MapLayer
-from cairn_map.errors import BadInputError, CairnError, ConflictError
+from cairn_map.errors import BadInputError, CairnError, ConflictError, UnreachableError
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.fingerprint import Fingerprint
 from cairn_map.evidence.grid import Cell, CellKey, Geometry, cell_of_key
@@ -46,6 +46,10 @@ log = logging.getLogger(__name__)
 
 REST_S = 3600.0
 """Time after which a refused commit is tried again."""
+EARLY_S = 60.0
+"""The same of one that was refused for its time, if the server does not say when."""
+BAD_CLOCK = "bad_clock"
+"""Kind of the refusal of a commit whose time the server cannot judge, or that is still to come for it."""
 KINDS_OF_ALL = ("http", "unknown_protocol")
 """Kinds of refusals that say nothing about the commit: a portal's or proxy's, and those of every request."""
 FORGET_AT_ONCE = 32
@@ -78,8 +82,10 @@ class RefusedPushes:
         """Cells, with their fingerprints, by which the server would not be healed."""
 
     def note(self, commit: CommitId, refusal: CairnError) -> None:
-        """Note that the server refused a commit; it rests if that was for its bytes."""
-        if isinstance(refusal, BadInputError) and refusal.kind not in KINDS_OF_ALL:
+        """Note that the server refused a commit; it rests if that was for its bytes or its time."""
+        if refusal.kind == BAD_CLOCK and isinstance(refusal, UnreachableError):
+            self._commits[commit] = refusal, self._steady_s() + min(refusal.retry_after_s or EARLY_S, REST_S)
+        elif isinstance(refusal, BadInputError) and refusal.kind not in KINDS_OF_ALL:
             self._commits[commit] = refusal, self._steady_s() + REST_S
 
     def of(self, commit: CommitId) -> CairnError | None:

@@ -56,6 +56,28 @@ class Contact(BaseModel):
     """Message of the last failure since the last whole round; empty if there was none."""
 
 
+CLOCKS_PART = 1e-4
+"""Seconds by which two clocks may part in a second: ten times what quartz does."""
+
+
+class LearntOffset(BaseModel):
+    """Lead of the server's time over the robot's steady clock, as it was learnt last."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    boot: str
+    """Boot of the machine with which the steady clock began."""
+    offset_s: float
+    error_s: float
+    """Bound of its error when it was learnt."""
+    steady_s: float
+    """Steady time at which it was learnt."""
+
+    def error_at(self, steady_s: float) -> float:
+        """Bound of its error at a steady time."""
+        return self.error_s + CLOCKS_PART * max(0.0, steady_s - self.steady_s)
+
+
 class CellCube(BaseModel):
     """Cube of cells around a robot: those of the server that a full robot keeps."""
 
@@ -140,6 +162,8 @@ class ReplicaState:
     """True if the robot registered without any token, and so can register again."""
     contact = _model_field("contact", Contact)
     """Last contact with the server, to ten seconds."""
+    server_clock = _model_field("server_clock", LearntOffset)
+    """The server's time by the robot's steady clock; None if no server has said it."""
     incarnation = Field("incarnation", Incarnation)
     """Incarnation under which the robot numbers its commits."""
     drawn = Field[list[Incarnation]](

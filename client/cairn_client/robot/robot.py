@@ -37,6 +37,7 @@ from cairn_client.robot.kept_scans import KeptScans
 from cairn_client.robot.membership import Membership, bind_token
 from cairn_client.robot.robot_events import SIZE, Committed, Events, EventStream
 from cairn_client.robot.rounds import Rounds
+from cairn_client.robot.server_clock import ServerClock, Times
 from cairn_client.robot.status_report import OwnStatus
 from cairn_client.sync.link_profile import LINKS, LinkName
 from cairn_client.sync.responses import Traffic
@@ -55,6 +56,7 @@ from cairn_map.errors import BadInputError, CairnError
 from cairn_map.evidence.grid import Geometry, cell_of_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.kernels.numba_runtime import show_compiling
+from cairn_map.machine_clocks import MACHINE_CLOCKS, MachineClocks
 from cairn_map.queries.map_snapshot import MapSnapshot
 from cairn_map.wire.messages import Mode
 
@@ -87,6 +89,8 @@ class Robot:
         carry_bytes_max: bytes on the disk for others' signed commits, carried from server to server; it needs a
             token of role relay that names this robot. 0: none are carried.
         keep_scans_bytes: bytes of the newest scans, kept in `directory/scans` for `amend`; their cost: `kept_scans`.
+        times: "own" for scans stamped by this machine's time of day; "recorded" for those of a recording.
+        clocks: clocks of this machine.
     """
 
     def __init__(
@@ -106,6 +110,8 @@ class Robot:
         stay: bool = False,
         carry_bytes_max: int = 0,
         keep_scans_bytes: int = 0,
+        times: Times = "own",
+        clocks: MachineClocks = MACHINE_CLOCKS,
     ) -> None:
         """Open or make the robot's directory; no network unless the map's geometry is unknown.
 
@@ -130,7 +136,7 @@ class Robot:
         """Count of the pixels of the measurements that were closed, by what became of them."""
         self._status = OwnStatus(every_s=self._profile.tell_every_s)
         self._events = Events()
-        self._api = RelayApi(server_url, token=token)
+        self._api = RelayApi(server_url, token=token, steady_s=clocks.steady_s)
         # The folder, scans first: the outbox asks them which commits must keep their bytes for an amend.
         with ExitStack() as opened:  # what was opened is closed again if a later step fails
             opened.callback(self._api.close)
@@ -141,6 +147,7 @@ class Robot:
             self._replica.state.note_use(url=map_url, mode=mode)
             carrier = carrier_in(Path(directory), self._api, self._map_name, size_bytes_max=carry_bytes_max)
             # Then what works on it; nothing is sent before the first round.
+            self._clock = ServerClock(self._replica.state, clocks, times=times)
             self._rounds = self._make_rounds(token, scope, carrier)
             self._measurement = self._new_measurement()
             opened.pop_all()  # from here on `close` does it
@@ -210,6 +217,7 @@ class Robot:
             profile=self._profile,
             limits=self._limits,
             status=self._status,
+            clock=self._clock,
             carrier=carrier,
         )
 
@@ -324,6 +332,7 @@ class Robot:
         if self._measurement is None:
             raise BadInputError("no_rig", "this robot was opened without a rig, so it cannot read scans")
         # The measurement first: it refuses what does not fit, before anything else has the scan.
+        self._clock.look()
         with self._lock:
             self._measurement.add(scan)
             self._kept_scans.add(scan)

@@ -22,6 +22,7 @@ from cairn_client.robot.cell_budget import NO_ROOM, CellBudget
 from cairn_client.robot.membership import Membership
 from cairn_client.robot.robot_events import Events
 from cairn_client.robot.round_watch import RoundWatch
+from cairn_client.robot.server_clock import ServerClock
 from cairn_client.robot.status_report import OwnStatus
 from cairn_client.sync.link_profile import LinkProfile
 from cairn_client.sync.near_cells import cell_at
@@ -125,6 +126,7 @@ class Rounds:
         profile: LinkProfile,
         limits: Limits,
         status: OwnStatus,
+        clock: ServerClock,
         carrier: Carrier | None = None,
     ) -> None:
         """Nothing is sent before `sync` or `start`."""
@@ -138,6 +140,7 @@ class Rounds:
         self._scope = profile.scope_of(scope)
         self._parts = profile.parts
         self._status = status
+        self._clock = clock
         self._carrier = carrier
         self._branch = replica.author.robot
         self._link = Link(api, map_name, branch=self._branch, has_epochs=replica.layer.has_epochs)
@@ -220,8 +223,11 @@ class Rounds:
         """One round; its failure is reported by the caller, who knows when it is tried again."""
         # The background and a caller of `sync` share the replica and the link: their rounds take turns.
         with self._lock:
-            with self._watch.cell_changes():
-                report = self._membership.as_member(self._push_and_fetch, on_push)
+            try:
+                with self._watch.cell_changes():
+                    report = self._membership.as_member(self._push_and_fetch, on_push)
+            finally:  # also of a round that failed, such as one whose registration was refused
+                self._clock.learn(self._api.take_time())
             self._watch.succeeded(report)
             return report
 

@@ -42,6 +42,23 @@ class Traffic:
 
 
 @dataclass(frozen=True, slots=True)
+class TimeSample:
+    """The server's time in one answer, and this machine's steady time then: the middle of question and answer."""
+
+    server_s: float
+    steady_s: float
+    error_s: float
+    """Half of the time between question and answer: the bound of the error of `server_s - steady_s`."""
+
+
+def narrower(one: TimeSample | None, other: TimeSample | None) -> TimeSample | None:
+    """The sample that says more; None if there is none."""
+    if one is None or other is None:
+        return one or other
+    return one if one.error_s <= other.error_s else other
+
+
+@dataclass(frozen=True, slots=True)
 class Answer:
     """A complete answer that is no error."""
 
@@ -85,7 +102,7 @@ def error_of(status: int, retry_after: str, body: bytes) -> CairnError:
     except ValueError:  # pydantic's ValidationError is one
         problem = Problem(kind="http", detail=f"the server answered {status}: {body[:200].decode(errors='replace')}")
     detail = one_line(problem.detail[:DETAIL_LENGTH_MAX])
-    if status in (429, 502, 503, 504, 507):
+    if status in (425, 429, 502, 503, 504, 507):
         wait_s = min(float(retry_after[:20]), RETRY_AFTER_MAX_S) if retry_after.isdecimal() else None
         return UnreachableError(problem.kind, detail, wait_s)
     families: dict[int, type[CairnError]] = {

@@ -12,7 +12,7 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
-from cairn_client.replica.replica import Replica
+from cairn_client.replica.replica import BAD_CLOCK, Replica
 from cairn_client.replica.replica_store import BaseCell
 from cairn_client.sync.exchange import Exchange, is_within
 from cairn_client.sync.near_cells import Wanted, in_order
@@ -122,6 +122,14 @@ def push_commits(
         # A refusal of this commit must not hold up the others; a broken link or a bad token ends the round.
         try:
             pushed = yield from _push(replica, commit, seal, parts)
+        except UnreachableError as exc:
+            if exc.kind != BAD_CLOCK:
+                raise
+            # It keeps its epoch, since others may have it already: the server takes it once its time has come.
+            log.warning("the server does not take commit %s yet: %s", commit_id, exc.message)
+            report.refused[commit_id] = exc
+            replica.refusals.note(commit_id, exc)
+            continue
         except ConflictError as exc:
             log.error("the server will not take commit %s: %s: %s", commit_id, exc.kind, exc.message)
             report.refused[commit_id] = exc

@@ -12,6 +12,7 @@ from cairn_map.errors import ConflictError, NotFoundError, UnreachableError
 from cairn_map.wire.relay_peer import Held, SignedCommit
 
 AUTHOR = Author(RobotName("mole"), Incarnation("0" * 16))
+EARLY = UnreachableError("bad_clock", "of the future", 3600.0)
 CUT, BUSY = UnreachableError("no_link", "cut"), UnreachableError("quota", "enough for today", 3000.0)
 
 
@@ -111,6 +112,25 @@ def test_a_commit_that_breaks_every_round_lets_others_go_by_and_is_not_forgotten
     there.breaks_at.clear()
     clock.now_s += 10_000
     assert not rounds(here, there, resting).is_all_there
+    assert rounds(here, there, resting).is_all_there
+    assert there.has == here.has
+
+
+def test_commits_of_the_future_wait_while_all_others_pass_and_count_as_not_there(
+    resting: Undelivered, clock: Clock
+) -> None:
+    here, there = Place(*range(5)), Place(7)
+    there.breaks_at = dict.fromkeys(ids(1, 3), EARLY)
+    first = rounds(here, there, resting)
+    assert (first.cut, first.later, first.refused, first.is_all_there) == (None, None, [], False)
+    assert [commit.n for commit, _ in first.early] == [1, 3]
+    assert (here.has, there.has) == (ids(*range(5), 7), ids(0, 2, 4, 7))
+    here.asked.clear()
+    again = rounds(here, there, resting)
+    assert (again.early, again.is_all_there, here.asked) == ([], False, []), "they are not sent again at once"
+    there.breaks_at.clear()
+    clock.now_s += 10_000
+    rounds(here, there, resting, 2)
     assert rounds(here, there, resting).is_all_there
     assert there.has == here.has
 

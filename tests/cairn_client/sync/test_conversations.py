@@ -7,7 +7,7 @@ import pytest
 from tests.fixtures.client.made import GEOMETRY, A, committed, covering, cursor, exchanged, header, opened, seen
 
 from cairn_client.replica.outbox import CommitFacts
-from cairn_client.replica.replica import REST_S, RefusedPushes, Replica
+from cairn_client.replica.replica import EARLY_S, REST_S, RefusedPushes, Replica
 from cairn_client.replica.replica_store import BaseCell
 from cairn_client.sync.requests import GetMissing, NextFrame, Push
 from cairn_client.sync.sync import fetch_missing, push_commits
@@ -86,6 +86,20 @@ def test_a_commit_that_is_refused_for_its_bytes_rests_for_an_hour(mole: Replica)
     assert refused(mole) == {first.id: no}
     mole.forget_server()
     assert refused(mole, None, None) == {}
+
+
+def test_a_commit_of_the_future_lets_others_go_by_and_rests_until_its_time_has_come(mole: Replica) -> None:
+    now_s = 0.0
+    mole.refusals = RefusedPushes(steady_s=lambda: now_s)
+    early, other, untold = committed(mole, X), committed(mole, Y), committed(mole, X)
+    no, later = UnreachableError("bad_clock", "the future", 600.0), UnreachableError("bad_clock", "no trust")
+    assert refused(mole, no, None, later) == {early.id: no, untold.id: later}
+    assert refused(mole) == {early.id: no, untold.id: later}, "neither is sent again at once"
+    now_s = EARLY_S
+    assert refused(mole, None) == {early.id: no}
+    now_s = 600.0
+    assert mole.kept_commit(early.id) is not None and mole.kept_commit(other.id) is not None
+    assert refused(mole, None) == {}, "with the same id and bytes"
 
 
 @pytest.mark.parametrize(

@@ -71,6 +71,7 @@ def _replay(args: argparse.Namespace) -> int:
         link=args.link,
         stay=True,
         keep_scans_bytes=kept_scans_bytes(args),
+        times="recorded",
     ) as robot:
         commits = _map_stops(robot, source, stops, Profile(args.profile) if args.profile else None, group)
         with (state / REPLAYED_FILE).open("a") as file:
