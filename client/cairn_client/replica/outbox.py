@@ -141,8 +141,8 @@ class Outbox:
         self._acked_since_header: set[CommitId] = set()
         self._retracts: dict[CommitId, tuple[CommitId, ...]] = {}
         """Commits that each kept commit takes out, as far as they were read."""
-        self._read_last: dict[CommitId, tuple[int, Epoch, dict[CellKey, bytes]]] = {}
-        """Size, epoch, and bytes of the cells, of the commits read last, oldest first."""
+        self._read_last: dict[CommitId, tuple[int, dict[CellKey, bytes]]] = {}
+        """Size, and bytes of the cells, of the commits read last, oldest first."""
         self.successors = Successors(self._store)
         self.amends = AmendRecords(self._store)
         for kept in self._store.commits():
@@ -242,7 +242,7 @@ class Outbox:
             poses=None if T_map_rig is None else poses_to_text(T_map_rig),
         )
         # The scans are the same: they keep their epoch, even if the clock is known better by now (rule T2).
-        epoch = self._bodies(latest)[0] if self._has_data(latest) else facts.epoch
+        epoch = self._commits[latest].epoch if latest in self._commits else facts.epoch
         facts = replace(facts, retracts=(latest,), epoch=epoch)
         return self.add(diff, facts, seen=seen, profile=profile, record=record)
 
@@ -440,24 +440,19 @@ class Outbox:
         Raises:
             DamagedDataError: its bytes at rest are not sound any more.
         """
-        epoch, bodies = self._bodies(commit)
-        return cell_history({epoch: decode_row(bodies[key], key, self._layer)})
+        return cell_history({self._commits[commit].epoch: decode_row(self._bodies(commit)[key], key, self._layer)})
 
-    def _has_data(self, commit: CommitId) -> bool:
-        kept = self._commits.get(commit)
-        return kept is not None and kept.has_data
-
-    def _bodies(self, commit: CommitId) -> tuple[Epoch, dict[CellKey, bytes]]:
-        """Epoch of a commit, and bytes of its cells; the commits read last stay, for a folder is read cell by cell."""
+    def _bodies(self, commit: CommitId) -> dict[CellKey, bytes]:
+        """Bytes of the cells of a commit; those of the commits read last stay, for a folder is read cell by cell."""
         if commit not in self._read_last:
             data = self._store.commit_data(commit) or b""
-            meta, bodies = split_commit(data)
-            self._read_last[commit] = len(data), meta.row, bodies
+            self._read_last[commit] = len(data), split_commit(data)[1]
             # Those read longest ago go first, and the newest one too if it alone is too large.
-            while sum(size for size, _, _ in self._read_last.values()) > READ_LAST_BYTES_MAX:
+            found = self._read_last[commit][1]
+            while sum(size for size, _ in self._read_last.values()) > READ_LAST_BYTES_MAX:
                 del self._read_last[next(iter(self._read_last))]
-            return meta.row, bodies
-        return self._read_last[commit][1:]
+            return found
+        return self._read_last[commit][1]
 
     def _note(self, kept: KeptCommit) -> None:
         # Its bytes may be new ones: a rename changes what an amend names.
@@ -492,4 +487,4 @@ class Outbox:
 
 
 def _kept(commit: Commit) -> KeptCommit:
-    return KeptCommit(commit.id, commit.sha, tuple(sorted(commit.cells)))
+    return KeptCommit(commit.id, commit.sha, tuple(sorted(commit.cells)), epoch=commit.meta.row)

@@ -13,7 +13,7 @@ import apsw
 
 from cairn_map.errors import BadInputError, DamagedDataError
 
-VERSION = 3
+VERSION = 4
 VALUE_BYTES_MAX = 256 << 20
 """Largest value that is read; a commit has at most 64 MB."""
 DDL = """
@@ -27,6 +27,7 @@ CREATE TABLE commits (
     cells TEXT NOT NULL,                -- numbers of the cells it touches, as JSON
     data BLOB,                          -- NULL once the commit may be forgotten
     seal TEXT,                          -- of a server's own retract, kept for it
+    epoch INTEGER,                      -- of its evidence; NULL: it has none
     UNIQUE (robot, incarnation, n)
 );
 CREATE TABLE coverage (name INTEGER PRIMARY KEY, vector TEXT NOT NULL UNIQUE);
@@ -44,9 +45,11 @@ STEPS = {
     1: "ALTER TABLE commits ADD COLUMN seal TEXT",
     # When older commits were acknowledged is unknown: they count from the first start with ages.
     2: "ALTER TABLE commits ADD COLUMN acked_age_s REAL NOT NULL DEFAULT 0",
+    # Older commits are of maps without epochs.
+    3: "ALTER TABLE commits ADD COLUMN epoch INTEGER",
 }
 """By version: what leads a store to the next one."""
-COLUMNS_SINCE = {("commits", "seal"): 2, ("commits", "acked_age_s"): 3}
+COLUMNS_SINCE = {("commits", "seal"): 2, ("commits", "acked_age_s"): 3, ("commits", "epoch"): 4}
 """Columns that the steps added, by table and name: the first version that has each."""
 KINDS = {"INTEGER": "'integer'", "REAL": "'real', 'integer'", "TEXT": "'text'", "BLOB": "'blob'"}
 """SQL of the storage classes that a column of a declared type may hold."""

@@ -22,6 +22,7 @@ from cairn_map.commits.commit import Commit
 from cairn_map.commits.cursor import Cursor, cursor_from_text
 from cairn_map.commits.ids import Author, CommitId
 from cairn_map.commits.version_vector import VersionVector, version_vector_from_json
+from cairn_map.epochs.epoch import BASE, Epoch, check_epoch
 from cairn_map.errors import CairnError, ConflictError, DamagedDataError, UnreachableError
 from cairn_map.evidence.fingerprint import Fingerprint, fingerprint_from_bytes
 from cairn_map.evidence.grid import CellKey
@@ -67,6 +68,8 @@ class KeptCommit:
     """Seal of a server's own retract, which is kept to be pushed back if the server loses it."""
     acked_age_s: float = 0.0
     """Age of the store when the server acknowledged it last, seconds."""
+    epoch: Epoch = BASE
+    """Row of the cells to which its evidence is added."""
 
 
 class ReplicaStore:
@@ -168,13 +171,22 @@ class ReplicaStore:
     def commits(self) -> list[KeptCommit]:
         """All commits, in the order in which they came."""
         rows = self._run(
-            "SELECT robot, incarnation, n, sha, cells, acked, data IS NOT NULL, seal, acked_age_s"
+            "SELECT robot, incarnation, n, sha, cells, acked, data IS NOT NULL, seal, acked_age_s, epoch"
             " FROM commits ORDER BY number"
         )
         with translate_damage(self.file):
             return [
-                KeptCommit(CommitId(Author(r, i), n), sha, _cells_of(cells), bool(acked), bool(has_data), seal, age_s)
-                for r, i, n, sha, cells, acked, has_data, seal, age_s in rows
+                KeptCommit(
+                    id=CommitId(Author(r, i), n),
+                    sha=sha,
+                    cells=_cells_of(cells),
+                    acked=bool(acked),
+                    has_data=bool(has_data),
+                    seal=seal,
+                    acked_age_s=age_s,
+                    epoch=BASE if epoch is None else check_epoch(epoch),
+                )
+                for r, i, n, sha, cells, acked, has_data, seal, age_s, epoch in rows
             ]
 
     def data_bytes(self, commits: Iterable[CommitId]) -> int:
@@ -190,8 +202,16 @@ class ReplicaStore:
     def add_commit(self, commit: Commit, *, seal: str | None = None) -> None:
         """Keep a commit; one with a seal is the server's own, which has it already."""
         self._run(
-            "INSERT INTO commits (robot, incarnation, n, sha, cells, data, seal) VALUES (?, ?, ?, ?, ?, ?, ?)",
-            (*_values(commit.id), commit.sha, json.dumps(sorted(commit.cells)), commit.data, seal),
+            "INSERT INTO commits (robot, incarnation, n, sha, cells, data, seal, epoch)"
+            " VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+            (
+                *_values(commit.id),
+                commit.sha,
+                json.dumps(sorted(commit.cells)),
+                commit.data,
+                seal,
+                commit.meta.epoch,
+            ),
         )
         if seal is not None:
             self.set_acked(commit.id, age_s=self.age_s())

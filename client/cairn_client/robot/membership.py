@@ -9,8 +9,9 @@ token nor anything that could be used elsewhere. A proof names the server that i
 """
 
 from collections.abc import Callable, Sequence
-from typing import ParamSpec, TypeVar
+from typing import ParamSpec, TypeVar, get_args
 
+from cairn_calib.rig.rig import Rig
 from cairn_client.http.api import MapApi
 from cairn_client.replica.replica import Replica
 from cairn_client.replica.replica_state import ReplicaState
@@ -167,3 +168,17 @@ class Membership:
             state.token = registered.token
             state.token_origin = self._api.origin
             state.may_register_openly = self._enrolment_token is None
+
+
+def check_kinds(rig: object, mode: object) -> None:
+    """Check what a robot is opened with, as far as a caller without a type checker may confuse it.
+
+    Raises:
+        BadInputError: `rig` is no rig, such as the path of one, or there is no such mode.
+    """
+    # `load_rig` takes a path and `Robot` a rig: without this, the path fails later, as an attribute that is missing.
+    if rig is not None and not isinstance(rig, Rig):
+        raise BadInputError("bad_rig", f"a rig is expected, got {type(rig).__name__}: cairn.load_rig(path) reads one")
+    # A mode that is none would be found out by the server, and only when there is a link.
+    if mode not in get_args(Mode):
+        raise BadInputError("bad_mode", f"the mode is one of {', '.join(get_args(Mode))}; got {mode!r}")

@@ -15,9 +15,10 @@ import os
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-from typing import Self, get_args
+from typing import Self
 
 import numpy.typing as npt
 
@@ -34,7 +35,7 @@ from cairn_client.robot.alignment import STEP_M, STEP_RAD, align_points, points_
 from cairn_client.robot.alignment_verdict import Alignment
 from cairn_client.robot.amending import Amending, AnyCommit, facts_of_measurement
 from cairn_client.robot.kept_scans import KeptScans
-from cairn_client.robot.membership import Membership, bind_token
+from cairn_client.robot.membership import Membership, bind_token, check_kinds
 from cairn_client.robot.robot_events import SIZE, Committed, Events, EventStream
 from cairn_client.robot.rounds import Rounds
 from cairn_client.robot.server_clock import ServerClock, Times
@@ -122,7 +123,7 @@ class Robot:
         """
         show_compiling()
         # All of this is checked before anything is opened or written.
-        _check_kinds(rig, mode)
+        check_kinds(rig, mode)
         server_url, self._map_name = split_map_url(map_url)
         self.name = robot_name(name)
         self.mode: Mode = mode
@@ -322,8 +323,11 @@ class Robot:
     def __repr__(self) -> str:
         return f"Robot({self.name} on map {self._map_name}, {self.mode}, {self.waiting} commits wait)"
 
-    def observe(self, scan: Scan) -> None:
+    def observe(self, scan: Scan) -> Commit | None:
         """Add a scan to the open measurement.
+
+        Returns:
+            None; on a map with epochs the commit of the scans before, if this one is of another epoch.
 
         Raises:
             BadInputError: the scan does not fit the rig or the map; nothing was added.
@@ -331,12 +335,22 @@ class Robot:
         self._check_open()
         if self._measurement is None:
             raise BadInputError("no_rig", "this robot was opened without a rig, so it cannot read scans")
-        # The measurement first: it refuses what does not fit, before anything else has the scan.
         self._clock.look()
         with self._lock:
+            commit = self._end_epoch_before(scan)
+            # The measurement first: it refuses what does not fit, before anything else has the scan.
             self._measurement.add(scan)
             self._kept_scans.add(scan)
             self._status.place_at(self._measurement.poses[-1])
+            return commit
+
+    def _end_epoch_before(self, scan: Scan) -> Commit | None:
+        """Commit the open measurement if its scans are of another epoch than this one: a commit is of one (rule T1)."""
+        open_s = self._measurement.captured_s if self._measurement else None
+        if open_s is None or not self._clock.parts(open_s[1], scan.time_s, self._replica.layer.epoch_s):
+            return None
+        log.info("an epoch of the map ended: the open measurement is committed")
+        return self._commit("", (), None, NO_NOTES)
 
     def mount(self, rig: Rig) -> None:
         """Mount another head, whose scans come from here on.
@@ -345,7 +359,7 @@ class Robot:
             BadInputError: kind `open_measurement`: there are scans of the old head.
         """
         self._check_open()
-        _check_kinds(rig, self.mode)
+        check_kinds(rig, self.mode)
         with self._lock:
             # A commit names one rig, by which an operator can retract it: scans of two heads must not share one.
             if self._measurement is not None and len(self._measurement):
@@ -583,18 +597,5 @@ class Robot:
         """Statements of a measurement's commit about itself."""
         if measurement is None:
             return CommitFacts(integrator=str(self._integrator), retracts=retracts, note=note)
-        return facts_of_measurement(measurement, note=note, retracts=retracts)
-
-
-def _check_kinds(rig: object, mode: object) -> None:
-    """Check what a caller without a type checker may confuse.
-
-    Raises:
-        BadInputError: `rig` is no rig, such as the path of one, or there is no such mode.
-    """
-    # `load_rig` takes a path and `Robot` a rig: without this, the path fails later, as an attribute that is missing.
-    if rig is not None and not isinstance(rig, Rig):
-        raise BadInputError("bad_rig", f"a rig is expected, got {type(rig).__name__}: cairn.load_rig(path) reads one")
-    # A mode that is none would be found out by the server, and only when there is a link.
-    if mode not in get_args(Mode):
-        raise BadInputError("bad_mode", f"the mode is one of {', '.join(get_args(Mode))}; got {mode!r}")
+        facts = facts_of_measurement(measurement, note=note, retracts=retracts)
+        return replace(facts, epoch=self._clock.epoch_of(facts.captured_s, self._replica.layer.epoch_s))

@@ -138,6 +138,11 @@ class ServerClock:
         time_s = self.server_time(last_s) if self._times == "own" else self.recorded_time(last_s)
         return None if time_s is None else epoch_of(time_s, epoch_s)
 
+    def parts(self, earlier_s: float, later_s: float, epoch_s: int | None) -> bool:
+        """True if a border between two epochs lies between two scans' times, as they were stamped."""
+        epochs = (self.epoch_of((time_s, time_s), epoch_s) for time_s in (earlier_s, later_s))
+        return len(set(epochs)) > 1
+
     def _both(self) -> tuple[float, float]:
         """Steady time, and the lead of the time of day over it."""
         steady_s = self._clocks.steady_s()

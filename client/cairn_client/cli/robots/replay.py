@@ -73,6 +73,8 @@ def _replay(args: argparse.Namespace) -> int:
         keep_scans_bytes=kept_scans_bytes(args),
         times="recorded",
     ) as robot:
+        if robot.replica.layer.has_epochs:
+            _try_sync(robot)  # it learns the server's time, by which epochs are counted
         commits = _map_stops(robot, source, stops, Profile(args.profile) if args.profile else None, group)
         with (state / REPLAYED_FILE).open("a") as file:
             file.write(f"{part}\n")
@@ -106,7 +108,7 @@ def _map_stops(
             scan = source.scan(index)
             if group is not None and group.ends_before(scan.time_s, scan.T_map_rig):
                 commits += _commit(robot, profile, note) is not None
-            robot.observe(scan)
+            commits += robot.observe(scan) is not None
         if group is None:
             commits += _commit(robot, profile, note) is not None
         if time.monotonic() - last_sync_s > SYNC_EVERY_S:
