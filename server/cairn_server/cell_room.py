@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 
 from cairn_map.codec.cell_reading import VOXEL_BYTES
+from cairn_map.codec.history_code import is_history, split_history
 from cairn_map.codec.octree.cell_head import head_sizes
 from cairn_map.errors import BadInputError, DamagedDataError, UnreachableError
 from cairn_map.evidence.grid import Geometry
@@ -109,13 +110,22 @@ def voxels_of_cell(geometry: Geometry) -> int:
 
 
 def decoded_bytes(geometry: Geometry, voxels: int) -> int:
-    """Most memory that decoding a cell takes: its grid, seen or not, or its known voxels, each with all samples."""
+    """Most memory that decoding a cell takes: its grid, seen or not, or its known voxels, each with all samples.
+
+    Of a cell with epochs the voxels are those of all its rows.
+    """
     return max(VOXEL_BYTES * voxels_of_cell(geometry), _each_bytes(DECODED_BYTES, geometry) * voxels)
 
 
-def changed_bytes(geometry: Geometry, voxels: int) -> int:
-    """Most memory that a cell of so many voxels takes that is decoded, changed, and encoded again."""
-    return _each_bytes(CHANGED_BYTES, geometry) * min(voxels, voxels_of_cell(geometry))
+def changed_bytes(geometry: Geometry, voxels: int, *, rows: int = 1) -> int:
+    """Most memory that a cell of so many voxels takes that is decoded, changed, and encoded again.
+
+    Args:
+        geometry: the map's.
+        voxels: known ones, counted in each row of the cell.
+        rows: count of the rows that are at work at once; all others are bytes.
+    """
+    return _each_bytes(CHANGED_BYTES, geometry) * min(voxels, rows * voxels_of_cell(geometry))
 
 
 def _each_bytes(parts: tuple[int, int, int], geometry: Geometry) -> int:
@@ -144,10 +154,12 @@ def check_geometry(geometry: Geometry, shares: MemoryShares) -> None:
 
 
 def voxels_of(body: bytes) -> int:
-    """Known voxels that the head of a cell's or diff's bytes claims; 0 where it is damaged, which decoding finds."""
+    """Known voxels that the heads of a cell's rows, or of a diff, claim; 0 where damaged, which decoding finds."""
     try:
+        if is_history(body):
+            return sum(head_sizes(row)[1] for row in split_history(body).rows.values())
         return head_sizes(body)[1]
-    except DamagedDataError:
+    except (DamagedDataError, BadInputError):
         return 0
 
 

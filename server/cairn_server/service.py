@@ -54,6 +54,7 @@ from cairn_server.sync.retracting import Retracts
 from cairn_server.sync.uploads import Uploads
 from cairn_server.views.cell_views import CellViews
 from cairn_server.views.export_tickets import ExportTickets
+from cairn_server.views.map_changes import MapChangesSearch
 from cairn_server.views.map_exports import MapExports
 from cairn_server.views.map_views import MapViews
 
@@ -84,6 +85,7 @@ class ViewParts:
     pictures: MapViews
     exports: MapExports
     tickets: ExportTickets
+    changes: MapChangesSearch
 
 
 class Service:
@@ -145,6 +147,7 @@ class Service:
             MapViews(store, self.cells, cache_share=settings.memory.cache_share),
             exports,
             ExportTickets(store, settings, exports),
+            MapChangesSearch(store, self.cells),
         )
 
     def _sync_parts(self, upstream: UpstreamProgress) -> SyncParts:

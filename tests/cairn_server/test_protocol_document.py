@@ -23,7 +23,7 @@ from cairn_server.store import numbering, shares
 from cairn_server.store.sqlite import tokens as sqlite_tokens
 from cairn_server.sync import cell_changes, missing, uploads
 from cairn_server.sync.checks import check_pool, commit_checks
-from cairn_server.views import export_tickets, map_exports, map_views
+from cairn_server.views import export_tickets, map_changes, map_exports, map_views, readings
 
 KIND = re.compile(r"[a-z]+(_[a-z]+)*")
 RAISERS = ("_problem", "send_problem", "__init__")
@@ -91,6 +91,9 @@ def test_the_statuses_in_the_document_are_those_of_the_code(kind: str) -> None:
         ("cells at the border of a box whose unknown space is filled", octomap.BORDER_CELLS_MAX),
         ("counting an export's points", map_exports.COUNT_S),
         ("exports counted at once", map_exports.COUNTS_AT_ONCE),
+        ("voxels in an answer about changes", map_changes.CHANGED_MAX),
+        ("searches for changes at once", map_changes.SEARCHES_AT_ONCE),
+        ("commits of a cell without epochs that are added up for its past", readings.PAST_ENTRIES_MAX),
         ("tickets for exports of one token", export_tickets.TICKETS_OF_TOKEN_MAX),
         ("tickets for exports", export_tickets.TICKETS_MAX),
         ("until a ticket ends", export_tickets.TICKET_S),

@@ -341,4 +341,4 @@ def new_memory_map(number: int, name: str, layer: MapLayer, sensor_model: Sensor
         epoch_s=layer.epoch_s,
     )
     log_id = secrets.token_bytes(16)
-    return MemoryMap(row, Cursor(log_id, 0, first_chain(log_id, layer.geometry.digest())))
+    return MemoryMap(row, Cursor(log_id, 0, first_chain(log_id, layer.digest())))

@@ -40,7 +40,7 @@ class MemorySnapshot:
     def chain_at(self, seq: int) -> bytes | None:
         """The chain after entry `seq` (0: of the empty log); None if there is no such entry."""
         if seq == 0:
-            return first_chain(self.head.log_id, self._state.row.geometry.digest())
+            return first_chain(self.head.log_id, self._state.row.layer.digest())
         return self._state.entries[seq - 1].chain if 0 < seq <= len(self._state.entries) else None
 
     def cell(self, key: CellKey) -> CellRow | None:

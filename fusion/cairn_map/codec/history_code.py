@@ -57,6 +57,11 @@ class DecodedHistory:
     digest: bytes
 
 
+def is_history(data: bytes) -> bool:
+    """True if bytes of a cell claim to be of version 2."""
+    return data[4:5] == bytes([VERSION])
+
+
 def encode_history(
     key: CellKey, history: CellHistory, layer: MapLayer, *, profile: Profile = Profile.FAST
 ) -> EncodedCell:

@@ -51,9 +51,9 @@ def cursor_from_text(text: str) -> Cursor:
         raise BadInputError("bad_cursor", f"a cursor is written log_id.seq.chain, got {text[:128]!r}") from None
 
 
-def first_chain(log_id: bytes, geometry_digest: bytes) -> bytes:
-    """Chain of an empty log."""
-    return hashlib.sha256(b"cairn-chain-0" + log_id + geometry_digest).digest()[:CHAIN_BYTES]
+def first_chain(log_id: bytes, layer_digest: bytes) -> bytes:
+    """Chain of an empty log; without epochs the digest of the map's layer is that of its geometry."""
+    return hashlib.sha256(b"cairn-chain-0" + log_id + layer_digest).digest()[:CHAIN_BYTES]
 
 
 def next_chain(chain: bytes, kind: bytes, commit: CommitId, sha: bytes) -> bytes:

@@ -12,8 +12,8 @@ are noisy. A voxel next to one that was occupied (appeared) or is occupied now (
 that is off by a voxel, and is reported apart. Temperatures change where the readings of both times have samples enough.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
 
 import numpy as np
 import numpy.typing as npt
@@ -55,8 +55,8 @@ class MapChanges:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Part:
-    """Voxels of one cell that may have changed, and those that are occupied."""
+class CellChanges:
+    """Voxels of one cell that may have changed, and those that are occupied; each array is (N, 3) voxel numbers."""
 
     appeared: Ints
     gone: Ints
@@ -64,6 +64,20 @@ class _Part:
     colder: Ints
     was_occupied: Ints
     is_occupied: Ints
+
+    @property
+    def size_bytes(self) -> int:
+        """Memory held by the arrays."""
+        return sum(getattr(self, each.name).nbytes for each in fields(self))
+
+    def within(self, low: Ints, high: Ints) -> "CellChanges":
+        """Part of it in a box of voxels, ends included."""
+        return CellChanges(**{each.name: voxels_within(getattr(self, each.name), low, high) for each in fields(self)})
+
+
+def voxels_within(voxels: Ints, low: Ints, high: Ints) -> Ints:
+    """Those of (N, 3) voxels that are in a box, ends included."""
+    return voxels[((voxels >= low) & (voxels <= high)).all(axis=1)]
 
 
 def map_changes(
@@ -86,11 +100,16 @@ def map_changes(
     Raises:
         BadInputError: kind `too_large`: the box around the cells has more than `EXTENT_MAX` voxels.
     """
-    parts = [
-        _part_of(key, history if until is None else history.until(until), geometry, model, since)
-        for key, history in cells.items()
-        if any(epoch > since for epoch in history)
-    ]
+    parts = (cell_changes(key, cells[key], geometry, model, since=since, until=until) for key in cells)
+    return joined_changes([part for part in parts if part is not None])
+
+
+def joined_changes(parts: Sequence[CellChanges]) -> MapChanges:
+    """Changes of the cells of these parts: candidates that stand together, and not next to a surface.
+
+    Raises:
+        BadInputError: kind `too_large`, as `map_changes`.
+    """
     lattice = _Lattice([voxels for part in parts for voxels in (part.was_occupied, part.is_occupied)])
     was, now = (lattice.numbers([getattr(part, name) for part in parts]) for name in ("was_occupied", "is_occupied"))
     # What stands together; and of it, what stands at a surface of the other time.
@@ -119,8 +138,19 @@ def likelihood_ratio(before: Ints, after: Ints) -> Floats:
     return np.asarray(2 * terms.sum(axis=(1, 2)))
 
 
-def _part_of(key: CellKey, history: CellHistory, geometry: Geometry, model: SensorModel, since: Epoch) -> _Part:
-    """Candidates of one cell."""
+def cell_changes(
+    key: CellKey,
+    history: CellHistory,
+    geometry: Geometry,
+    model: SensorModel,
+    *,
+    since: Epoch,
+    until: Epoch | None = None,
+) -> CellChanges | None:
+    """Candidates of one cell, with arguments as of `map_changes`; None: nothing of it was captured after `since`."""
+    history = history if until is None else history.until(until)
+    if not any(epoch > since for epoch in history):
+        return None
     before, now = present(history, geometry, model, at=since), present(history, geometry, model)
     # The voxels of `now` are all; where each was before.
     rows = np.searchsorted(now.voxels, before.voxels)
@@ -137,7 +167,7 @@ def _part_of(key: CellKey, history: CellHistory, geometry: Geometry, model: Sens
     def numbers(mask: npt.NDArray[np.bool_]) -> Ints:
         return voxels_in_cell(now.voxels[mask], key, geometry)
 
-    return _Part(
+    return CellChanges(
         appeared=numbers(occupied & ~was & is_sure),
         gone=numbers(was & ~occupied & is_sure),
         warmer=numbers(occupied & (warmth > WARMER_K)),

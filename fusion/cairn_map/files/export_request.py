@@ -13,6 +13,7 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from cairn_map.arrays import Floats
+from cairn_map.epochs.moment import TimeText
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey, Geometry, cell_of_key, centres_of_voxels, voxels_in_cell
@@ -61,6 +62,8 @@ class ExportRequest(BaseModel):
     """Octree depth of the nodes; None: voxels."""
     unknown: Literal["free", "occupied"] | None = None
     """State that an octree gives to unknown space in the box, as if measured once; None: it stays unknown."""
+    at: TimeText | None = None
+    """Time at which the map is read; None: now."""
 
     @model_validator(mode="after")
     def _fills_a_box_of_an_octree(self) -> Self:

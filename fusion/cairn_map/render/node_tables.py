@@ -51,7 +51,7 @@ def mean_table(cell: BrickCell, channel: Channel, geometry: Geometry) -> Table:
 def _pyramid(voxels: Floats, join: Callable[[Floats], Floats]) -> Floats:
     """(B, 585, P) nodes of (B * 512, P) voxels: eight neighbours in Morton order are joined to one, three times."""
     B = len(voxels) // 512
-    nodes = [voxels.reshape(B, 512, -1)]
+    nodes = [voxels.reshape(B, 512, voxels.shape[1])]
     for count in (64, 8, 1):
-        nodes.append(join(nodes[-1].reshape(B, count, 8, -1)))
+        nodes.append(join(nodes[-1].reshape(B, count, 8, voxels.shape[1])))
     return np.concatenate(nodes, axis=1)

@@ -7,6 +7,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from cairn_map.arrays import Floats
+from cairn_map.epochs.moment import TimeText
 from cairn_map.errors import BadInputError, first_error
 from cairn_map.render.camera_rays import CameraRays, look_at, pinhole
 from cairn_map.render.pose_spread import SIGMA_MAX_M, SIGMA_MAX_RAD, PoseSpread
@@ -58,6 +59,8 @@ class RenderRequest(BaseModel):
     """Covariance of the pose, in place of the two sigmas: 21 numbers with commas between, as
     `pose_spread.PoseSpread.of_lower` takes them."""
     format: Literal["png", "npz"] = "png"
+    at: TimeText | None = None
+    """Time at which the map is read; None: now."""
 
     @model_validator(mode="after")
     def _whole(self) -> Self:

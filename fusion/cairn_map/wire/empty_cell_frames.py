@@ -16,10 +16,13 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_map.codec.cell_code import encode_empty_cell
+from cairn_map.codec.layer_code import encode_layer_cell
 from cairn_map.codec.octree.cell_head import INDICES_AT
 from cairn_map.commits.cursor import Cursor
+from cairn_map.epochs.cell_history import NOTHING
+from cairn_map.epochs.layer import MapLayer
 from cairn_map.evidence.fingerprint import ZERO
-from cairn_map.evidence.grid import CELL_LIMIT, CellKey, Geometry
+from cairn_map.evidence.grid import CELL_LIMIT, CellKey
 from cairn_map.kernels.morton_kernels import UInts, deinterleave
 from cairn_map.wire.frames import CELL_HEAD, PREFIX, CellFrame, FrameKind, encode_frame
 
@@ -39,7 +42,7 @@ class EmptyCellFrames:
     """(N,) numbers of the cells."""
     from_cursor: Cursor | None
     to_cursor: Cursor
-    geometry: Geometry
+    layer: MapLayer
 
     @property
     def count(self) -> int:
@@ -49,7 +52,7 @@ class EmptyCellFrames:
     @property
     def size_bytes(self) -> int:
         """Bytes of all their heads and payloads."""
-        payload = len(encode_empty_cell(CellKey(0), self.geometry)) if self.kind is FrameKind.FULL else 0
+        payload = len(self._payload(CellKey(0))) if self.kind is FrameKind.FULL else 0
         return self.count * (CELL_HEAD.size + payload)
 
     def encoded(self) -> Iterator[bytes]:
@@ -83,8 +86,13 @@ class EmptyCellFrames:
             from_cursor=self.from_cursor,
             to_cursor=self.to_cursor,
             fingerprint=ZERO,
-            payload=encode_empty_cell(cell, self.geometry) if self.kind is FrameKind.FULL else b"",
+            payload=self._payload(cell) if self.kind is FrameKind.FULL else b"",
         )
+
+    def _payload(self, cell: CellKey) -> bytes:
+        if self.layer.has_epochs:
+            return encode_layer_cell(cell, NOTHING, self.layer).data
+        return encode_empty_cell(cell, self.layer.geometry)
 
 
 def _bytes_of(numbers: npt.NDArray[np.generic]) -> npt.NDArray[np.uint8]:

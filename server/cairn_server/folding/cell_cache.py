@@ -1,4 +1,4 @@
-"""Cells under change, within a memory bound: `BrickCell`s, which add fast, the oldest encoded when the bound is met.
+"""Cells under change, within a memory bound: sums, which add fast, the oldest cells encoded when the bound is met.
 
 A changed cell that no longer fits waits as a draft of its row, and is decoded from there when it is needed again. So
 one fold may touch any number of cells. Each is decoded, changed and encoded within the room that all lanes share.
@@ -10,14 +10,14 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from typing import NamedTuple, Protocol
 
-from cairn_map.codec.cell_code import DecodedCell, encode_cell
+from cairn_map.codec.cell_code import DecodedCell
+from cairn_map.codec.layer_code import write_cell
 from cairn_map.commits.cursor import Cursor
+from cairn_map.epochs.epoch import BASE, Epoch
+from cairn_map.epochs.history_cell import HistoryCell
 from cairn_map.evidence.blocks import Blocks, blocks_of
-from cairn_map.evidence.brick_cell import BrickCell
-from cairn_map.evidence.cell_order import hottest_k
 from cairn_map.evidence.compact_cell import HELD_PER_BYTE
 from cairn_map.evidence.evidence import Evidence
-from cairn_map.evidence.fingerprint import fingerprint
 from cairn_map.evidence.grid import CellKey, Geometry
 from cairn_server.cell_room import changed_bytes
 from cairn_server.folding.cells_at_rest import stamps_to_change
@@ -26,9 +26,7 @@ from cairn_server.store.row_spool import RowSpool
 from cairn_server.store.stamps import CellStamps
 from cairn_server.store.store_rows import CellRow
 
-Step = Callable[[BrickCell, Evidence], None]
-VOXEL_BYTES = 4
-"""Least memory of a voxel in the bricks of a cell, known or not."""
+Step = Callable[[HistoryCell, Epoch, Evidence], None]
 
 
 class StoredCells(Protocol):
@@ -38,7 +36,7 @@ class StoredCells(Protocol):
         """Row of a cell, unchecked; None: never seen."""
         ...
 
-    def opened(self, key: CellKey, row: CellRow | None) -> tuple[BrickCell, CellStamps]:
+    def opened(self, key: CellKey, row: CellRow | None) -> tuple[HistoryCell, CellStamps]:
         """Cell of a row, to be changed."""
         ...
 
@@ -60,7 +58,7 @@ class CellCache:
         self.size_bytes = 0
         self._geometry = geometry
         self._cursor: Cursor | None = None
-        self._cells: OrderedDict[CellKey, tuple[BrickCell, CellStamps]] = OrderedDict()
+        self._cells: OrderedDict[CellKey, tuple[HistoryCell, CellStamps]] = OrderedDict()
         self._sizes: dict[CellKey, int] = {}
         self._changed: set[CellKey] = set()
         self._drafts = self._memory.spool()
@@ -74,9 +72,16 @@ class CellCache:
             self._cursor = cursor
 
     def change(
-        self, key: CellKey, voxels: int, read: Callable[[], DecodedCell], step: Step, stored: StoredCells
+        self,
+        key: CellKey,
+        voxels: int,
+        read: Callable[[], DecodedCell],
+        step: Step,
+        stored: StoredCells,
+        *,
+        epoch: Epoch = BASE,
     ) -> Changed:
-        """Merge or unmerge (`step`) a diff of so many voxels, which `read` decodes, into a cell.
+        """Merge or unmerge (`step`) a diff of so many voxels, which `read` decodes, into a cell's row of an epoch.
 
         Raises:
             BadInputError: a sum would leave its range; nothing was changed.
@@ -86,7 +91,7 @@ class CellCache:
         with self._memory.room.of(changed_bytes(self._geometry, voxels + known)):
             diff = read()
             cell, stamps = self._cells.get(key) or stored.opened(key, row)
-            step(cell, diff.evidence)
+            step(cell, epoch, diff.evidence)
             changed = Changed(blocks_of(diff.evidence), diff.digest)
             del diff
         self._keep(key, cell, stamps)
@@ -174,34 +179,41 @@ class CellCache:
         """Row of which a cell is made that is not cached: drafted and dropped since, else in the store."""
         return None if key in self._cells else self._drafts.get(key) or stored.row(key)
 
-    def _keep(self, key: CellKey, cell: BrickCell, stamps: CellStamps) -> None:
+    def _keep(self, key: CellKey, cell: HistoryCell, stamps: CellStamps) -> None:
         # A draft is out of date with the first change after it.
         self._drafts.drop(key)
         self._changed.add(key)
         self._cells[key] = cell, stamps
         self._cells.move_to_end(key)
+        self._measure(key)
+        self.trim()
+
+    def _measure(self, key: CellKey) -> None:
+        cell, stamps = self._cells[key]
         size_bytes = cell.size_bytes + stamps.nbytes
         self.size_bytes += size_bytes - self._sizes.get(key, 0)
         self._sizes[key] = size_bytes
-        self.trim()
 
     def _encoded(self, key: CellKey) -> CellRow:
         cell, stamps = self._cells[key]
-        # No more voxels are known than its bricks have.
-        with self._memory.room.of(changed_bytes(self._geometry, cell.counts.size_bytes // VOXEL_BYTES)):
-            evidence = cell.packed()
-            encoded = encode_cell(key, evidence, self._geometry)
-            return CellRow(
-                key=key,
-                lm=stamps.newest(),
-                digest=encoded.digest,
-                fingerprint=fingerprint(evidence, key),
-                voxels=len(evidence),
-                body=encoded.data,
-                size_bytes=len(encoded.data),
-                stamps=stamps.encoded(),
-                hottest_k=hottest_k(evidence, self._geometry),
-            )
+        # One row at a time is packed and encoded, of no more voxels than it has bricks for.
+        with self._memory.room.of(changed_bytes(self._geometry, cell.voxels_max)):
+            written = write_cell(cell)
+        # Rows that commits hardly ever come to rest as the bytes that were just made of them.
+        cell.rest()
+        self._measure(key)
+        return CellRow(
+            key=key,
+            lm=stamps.newest(),
+            digest=written.digest,
+            fingerprint=written.fingerprint,
+            voxels=written.voxels,
+            body=written.data,
+            size_bytes=len(written.data),
+            stamps=stamps.encoded(),
+            hottest_k=written.hottest_k,
+            history_bytes=written.history_bytes,
+        )
 
 
 def _stamped(draft: CellRow, blocks: Blocks, seq: int, geometry: Geometry) -> CellRow:

@@ -61,7 +61,7 @@ class Cells:
             DamagedCellError: kind `damaged_store`: it is damaged and cannot be rebuilt from the log.
         """
         with self.reading(row) as faults, self._store.snapshot(row) as snapshot:
-            return sound_cell(snapshot, key, row.geometry, faults.healed), head_of(snapshot)
+            return sound_cell(snapshot, key, row.layer, faults.healed), head_of(snapshot)
 
     def unchecked(self, row: MapRow, key: CellKey) -> tuple[CellRow | None, Head]:
         """One cell whose bytes may be damaged: for callers that decode them, or need the digest only.

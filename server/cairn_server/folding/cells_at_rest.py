@@ -8,13 +8,16 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import TypeVar
 
-from cairn_map.codec.cell_code import DecodedCell, decode_cell, decode_met, encode_cell
+from cairn_map.codec.cell_code import DecodedCell, decode_cell, decode_met
+from cairn_map.codec.history_code import DecodedHistory
+from cairn_map.codec.layer_code import WrittenCell, decode_layer_cell, read_cell, row_coding, write_cell
 from cairn_map.commits.cursor import ENTRY_FOLD
+from cairn_map.epochs.cell_history import CellHistory, history_fingerprint
+from cairn_map.epochs.history_cell import HistoryCell
+from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import CairnError, DamagedDataError
-from cairn_map.evidence.brick_cell import BrickCell
-from cairn_map.evidence.cell_order import hottest_k
 from cairn_map.evidence.evidence import Evidence
-from cairn_map.evidence.fingerprint import Fingerprint, fingerprint
+from cairn_map.evidence.fingerprint import Fingerprint
 from cairn_map.evidence.grid import CellKey, Geometry, cell_of_key
 from cairn_server.cell_room import DECODING
 from cairn_server.store.stamps import CellStamps, Stamps, decode_cell_stamps, decode_stamps
@@ -39,35 +42,85 @@ class DamagedCellError(DamagedDataError):
         return type(self), (self.key, self.message)
 
 
-def stored_evidence(stored: CellRow) -> Evidence:
-    """Evidence of a stored cell.
+def stored_history(stored: CellRow, layer: MapLayer) -> CellHistory:
+    """All rows of a stored cell's evidence; of a map without epochs it is one, the base.
 
     Raises:
         DamagedDataError: kind `damaged_store`: its bytes are not sound, or do not have its digest.
     """
-    decoded = _as_it_was(stored, decode_cell)
-    if fingerprint(decoded.evidence, stored.key) != stored.fingerprint:
-        raise DamagedDataError("damaged_store", f"cell {cell_of_key(stored.key)} at rest does not have its fingerprint")
-    return decoded.evidence
+    found = decode_rows(stored.key, stored.body, layer)
+    _check_is(stored, found.digest, history_fingerprint(found.history, stored.key, layer_word=layer.word))
+    return found.history
+
+
+def decode_rows(key: CellKey, body: bytes, layer: MapLayer) -> DecodedHistory:
+    """All rows of a cell of the map that was sound when it was stored.
+
+    Raises:
+        DamagedDataError: kind `damaged_store`.
+    """
+    try:
+        return decode_layer_cell(body, key, layer)
+    except CairnError as exc:
+        raise _not_sound(key, exc) from exc
 
 
 def stored_surfaces(stored: CellRow) -> Evidence:
-    """Voxels of `stored_evidence` that were hit or have samples, in a third of the time.
+    """Voxels of a stored cell without epochs that were hit or have samples, in a third of the time.
 
     Raises:
         DamagedDataError: kind `damaged_store`: its bytes are not sound, or do not have its digest.
     """
-    return _as_it_was(stored, decode_met).evidence
+    decoded = _decoded(stored.key, stored.body, decode_met)
+    _check_is(stored, decoded.digest, stored.fingerprint)
+    return decoded.evidence
 
 
-def _as_it_was(stored: CellRow, decode: Callable[[bytes], DecodedCell]) -> DecodedCell:
-    decoded = _decoded(stored.key, stored.body, decode)
-    if decoded.digest != stored.digest:
+def check_stored(stored: CellRow, layer: MapLayer) -> None:
+    """Refuse a stored cell that is not as it was written; one row of it at a time is decoded.
+
+    Raises:
+        DamagedDataError: kind `damaged_store`: its bytes are not sound, or do not have its digest.
+    """
+    if layer.has_epochs:
+        _opened(stored, layer)
+    else:
+        stored_history(stored, layer)
+
+
+def _opened(stored: CellRow, layer: MapLayer) -> HistoryCell:
+    """Stored cell, to be changed.
+
+    Raises:
+        DamagedDataError: as `stored_history`.
+    """
+    if not layer.has_epochs:
+        # Its one row is about to be changed: decoded once, not to bytes and again to sums.
+        cell = HistoryCell(stored.key, layer, row_coding(layer))
+        for epoch, row in stored_history(stored, layer).rows.items():
+            cell.merge(epoch, row)
+        return cell
+    try:
+        cell = read_cell(stored.body, stored.key, layer)
+        written = write_cell(cell)
+    except CairnError as exc:
+        raise _not_sound(stored.key, exc) from exc
+    _check_is(stored, written.digest, written.fingerprint)
+    return cell
+
+
+def _check_is(stored: CellRow, digest: bytes, fingerprint: Fingerprint) -> None:
+    if digest != stored.digest:
         raise DamagedDataError("damaged_store", f"cell {cell_of_key(stored.key)} at rest does not have its digest")
-    return decoded
+    if fingerprint != stored.fingerprint:
+        raise DamagedDataError("damaged_store", f"cell {cell_of_key(stored.key)} at rest does not have its fingerprint")
 
 
-def sound_cell(snapshot: Snapshot, key: CellKey, geometry: Geometry, healed: list[CellRow]) -> CellRow | None:
+def _not_sound(key: CellKey, why: CairnError) -> DamagedDataError:
+    return DamagedDataError("damaged_store", f"cell {cell_of_key(key)} at rest: {why.message}")
+
+
+def sound_cell(snapshot: Snapshot, key: CellKey, layer: MapLayer, healed: list[CellRow]) -> CellRow | None:
     """A cell whose bytes may be sent, rebuilt from the log if the stored ones are damaged; None: never seen.
 
     Bytes that were found sound are remembered by their checksum, so that only new ones are decoded. A rebuilt cell is
@@ -79,19 +132,19 @@ def sound_cell(snapshot: Snapshot, key: CellKey, geometry: Geometry, healed: lis
     stored = row_of_cell(snapshot, key)
     if stored is None or _SOUND.knows(stored):
         return stored
-    with DECODING.of_cell(geometry, stored.voxels):
+    with DECODING.of_cell(layer.geometry, stored.voxels):
         try:
-            stored_evidence(stored)
+            check_stored(stored, layer)
         except DamagedDataError as exc:
             log.error("%s; rebuilding it from the log", exc.message)
-            rebuilt = _proven_rebuilt(snapshot, stored, geometry, exc)
+            rebuilt = _proven_rebuilt(snapshot, stored, layer, exc)
             healed.append(rebuilt)
             return rebuilt
     _SOUND.note(stored)
     return stored
 
 
-def rebuilt_cell(snapshot: Snapshot, stored: CellRow, geometry: Geometry) -> CellRow:
+def rebuilt_cell(snapshot: Snapshot, stored: CellRow, layer: MapLayer) -> CellRow:
     """Cell as the log says that it is.
 
     Raises:
@@ -100,21 +153,25 @@ def rebuilt_cell(snapshot: Snapshot, stored: CellRow, geometry: Geometry) -> Cel
     if stored.gone_seq:
         raise DamagedDataError("damaged_store", "evidence that it was made from is not kept any more")
     contributions = snapshot.contributions(stored.key, after_seq=0)
-    evidence = sum_of_contributions(snapshot, stored.key, contributions, geometry).packed()
-    encoded = encode_cell(stored.key, evidence, geometry)
+    return with_bytes(stored, write_cell(sum_of_contributions(snapshot, stored.key, contributions, layer)))
+
+
+def with_bytes(stored: CellRow, written: WrittenCell) -> CellRow:
+    """A cell's row with these bytes, and all that follows from them."""
     return replace(
         stored,
-        digest=encoded.digest,
-        fingerprint=fingerprint(evidence, stored.key),
-        voxels=len(evidence),
-        body=encoded.data,
-        size_bytes=len(encoded.data),
-        hottest_k=hottest_k(evidence, geometry),
+        digest=written.digest,
+        fingerprint=written.fingerprint,
+        voxels=written.voxels,
+        body=written.data,
+        size_bytes=len(written.data),
+        hottest_k=written.hottest_k,
+        history_bytes=written.history_bytes,
     )
 
 
 def decode_stored(key: CellKey, body: bytes) -> DecodedCell:
-    """A cell or diff that was sound when it was stored.
+    """A commit's diff of a cell, which was sound when it was stored.
 
     Raises:
         DamagedDataError: kind `damaged_store`.
@@ -126,30 +183,30 @@ def _decoded(key: CellKey, body: bytes, decode: Callable[[bytes], DecodedCell]) 
     try:
         decoded = decode(body)
     except CairnError as exc:
-        raise DamagedDataError("damaged_store", f"cell {cell_of_key(key)} at rest: {exc.message}") from exc
+        raise _not_sound(key, exc) from exc
     if decoded.key != key:
         raise DamagedDataError("damaged_store", f"cell {cell_of_key(key)} at rest is cell {cell_of_key(decoded.key)}")
     return decoded
 
 
 def sum_of_contributions(
-    snapshot: Snapshot, key: CellKey, contributions: Iterable[Contribution], geometry: Geometry
-) -> BrickCell:
-    """Sum of what log entries did to a cell.
+    snapshot: Snapshot, key: CellKey, contributions: Iterable[Contribution], layer: MapLayer
+) -> HistoryCell:
+    """Sum of what log entries did to a cell, each in the epoch of its commit (rule T6).
 
     Raises:
         DamagedDataError: kind `damaged_store`: a diff is not sound, or not kept any more.
     """
-    total = BrickCell(geometry)
+    total = HistoryCell(key, layer, row_coding(layer))
     for contribution in contributions:
         body = snapshot.diff(contribution.commit, key)
         if body is None:
             raise DamagedDataError("damaged_store", f"a diff of cell {cell_of_key(key)} is not there")
         evidence = decode_stored(key, body).evidence
         if contribution.kind == ENTRY_FOLD:
-            total.merge(evidence)
+            total.merge(contribution.epoch, evidence)
         else:
-            total.unmerge(evidence)
+            total.unmerge(contribution.epoch, evidence)
     return total
 
 
@@ -172,23 +229,21 @@ def _sound_stamps(stored: CellRow, decode: Callable[[bytes], T]) -> T:
 
 
 def cell_to_change(
-    snapshot: Snapshot, key: CellKey, stored: CellRow | None, geometry: Geometry
-) -> tuple[BrickCell, CellStamps]:
+    snapshot: Snapshot, key: CellKey, stored: CellRow | None, layer: MapLayer
+) -> tuple[HistoryCell, CellStamps]:
     """Cell of a row of the map, to be changed; a damaged one is rebuilt from the log.
 
     Raises:
         DamagedCellError: it is damaged, and the log cannot rebuild it.
     """
-    cell = BrickCell(geometry)
     if stored is None:
-        return cell, CellStamps(geometry.depth)
-    stamps = stamps_to_change(stored, geometry)
+        return HistoryCell(key, layer, row_coding(layer)), CellStamps(layer.geometry.depth)
+    stamps = stamps_to_change(stored, layer.geometry)
     try:
-        cell.merge(stored_evidence(stored))
+        return _opened(stored, layer), stamps
     except DamagedDataError as exc:
         log.error("%s; rebuilding it from the log", exc.message)
-        cell.merge(stored_evidence(_proven_rebuilt(snapshot, stored, geometry, exc)))
-    return cell, stamps
+        return _opened(_proven_rebuilt(snapshot, stored, layer, exc), layer), stamps
 
 
 def row_of_cell(snapshot: Snapshot, key: CellKey) -> CellRow | None:
@@ -203,10 +258,10 @@ def row_of_cell(snapshot: Snapshot, key: CellKey) -> CellRow | None:
         raise DamagedCellError(key, exc.message) from exc
 
 
-def _proven_rebuilt(snapshot: Snapshot, stored: CellRow, geometry: Geometry, why: DamagedDataError) -> CellRow:
+def _proven_rebuilt(snapshot: Snapshot, stored: CellRow, layer: MapLayer, why: DamagedDataError) -> CellRow:
     """A damaged cell rebuilt from the log, if its digest or its fingerprint proves that the log has all of it."""
     try:
-        rebuilt = rebuilt_cell(snapshot, stored, geometry)
+        rebuilt = rebuilt_cell(snapshot, stored, layer)
     except DamagedDataError as exc:
         raise DamagedCellError(
             stored.key,

@@ -23,6 +23,7 @@ from functools import cache
 from typing import NamedTuple
 
 from cairn_map.codec.cell_reading import cell_reader
+from cairn_map.codec.history_code import is_history, split_history
 from cairn_map.codec.octree.cell_head import head_sizes
 from cairn_map.commits.commit import CELLS_MAX
 from cairn_map.commits.ids import CommitId
@@ -67,7 +68,7 @@ def decoding_of(snapshot: Snapshot, cached: Container[CellKey]) -> Callable[[Cel
         stored = None if key in cached else snapshot.cell(key)
         if stored is None:
             return 0.0
-        work_s, sums_bytes = _work_s(stored.body)
+        work_s, sums_bytes = _stored_work_s(stored.body)
         # Any other cell stays decoded after the fold.
         return work_s if sums_bytes > HELD_PER_BYTE * len(stored.body) else 0.0
 
@@ -94,6 +95,17 @@ def _work_s(body: bytes) -> tuple[float, int]:
     except CairnError:
         return 0.0, 0
     return VOXEL_S * reader.head.voxels + BRICK_S * bricks, BRICK_BYTES * bricks
+
+
+def _stored_work_s(body: bytes) -> tuple[float, int]:
+    """Work of a cell of the map: each of its rows is decoded, and the newest stays so (`HistoryCell.rest`)."""
+    if not is_history(body):
+        return _work_s(body)
+    try:
+        rows = [_work_s(row) for row in split_history(body).rows.values()]
+    except CairnError:
+        return 0.0, 0
+    return sum(work_s for work_s, _ in rows), rows[-1][1] if rows else 0
 
 
 class RetractPart(NamedTuple):

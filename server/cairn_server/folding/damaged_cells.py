@@ -8,18 +8,17 @@ it is read or folded into.
 import logging
 import threading
 from collections.abc import Iterable
-from dataclasses import replace
 from itertools import islice
 
 from cairn_map.codec.cell_code import decode_canonical_cell
 from cairn_map.codec.cell_reading import VOXEL_BYTES
+from cairn_map.codec.history_code import check_canonical_history
+from cairn_map.codec.layer_code import WrittenCell, read_cell, write_cell
 from cairn_map.errors import BadInputError, CairnError, ConflictError, DamagedDataError, NotFoundError
-from cairn_map.evidence.cell_order import hottest_k
-from cairn_map.evidence.fingerprint import fingerprint
 from cairn_map.evidence.grid import CellKey, cell_of_key
 from cairn_map.wire.messages import DAMAGED_MAX
 from cairn_server.cell_room import DECODING
-from cairn_server.folding.cells_at_rest import sound_cell
+from cairn_server.folding.cells_at_rest import sound_cell, with_bytes
 from cairn_server.store.store import Snapshot, Store
 from cairn_server.store.store_rows import CellRow, MapRow
 
@@ -89,7 +88,7 @@ def heal_cell(store: Store, row: MapRow, key: CellKey, data: bytes, *, by: str) 
     with store.snapshot(row) as snapshot:
         healed: list[CellRow] = []
         try:
-            if sound_cell(snapshot, key, row.geometry, healed) is None:
+            if sound_cell(snapshot, key, row.layer, healed) is None:
                 raise NotFoundError("no_cell", f"no robot has seen cell {cell_of_key(key)} of map {row.name}")
             stored = None
         except DamagedDataError:
@@ -97,31 +96,41 @@ def heal_cell(store: Store, row: MapRow, key: CellKey, data: bytes, *, by: str) 
     if stored is None:
         keep_healed(store, row, healed)
         return False
-    # Decode within the memory that a cell of as many voxels can need: what claims more is another cell.
-    limit_bytes = stored.voxels * (VOXEL_BYTES + 4 + 8 * row.geometry.plane_count)
-    with DECODING.of_cell(row.geometry, stored.voxels):
-        decoded = decode_canonical_cell(data, evidence_bytes_max=limit_bytes)
-    if decoded.key != key or decoded.geometry != row.geometry:
-        raise BadInputError("bad_cell", f"the body is no cell {cell_of_key(key)} of map {row.name}")
-    if decoded.digest != stored.digest:
+    written = _canonical(data, key, row, voxels=stored.voxels)
+    if written.digest != stored.digest:
         raise ConflictError(
             "other_cell",
             f"cell {cell_of_key(key)} had digest {stored.digest.hex()} at entry {stored.lm}, the body has "
-            f"{decoded.digest.hex()}",
+            f"{written.digest.hex()}",
         )
     # Write it, unless a fold changed the cell meanwhile.
-    sound = replace(
-        stored,
-        fingerprint=fingerprint(decoded.evidence, key),
-        voxels=len(decoded.evidence),
-        body=data,
-        size_bytes=len(data),
-        hottest_k=hottest_k(decoded.evidence, row.geometry),
-    )
+    sound = with_bytes(stored, written)
     if not store.health.heal(row, sound):
         return False
     store.audit_log.add(by, "healed_cell", f"map {row.name}: {cell_of_key(key)} from {len(data)} bytes that were sent")
     return True
+
+
+def _canonical(data: bytes, key: CellKey, row: MapRow, *, voxels: int) -> WrittenCell:
+    """These bytes as a cell of a map that had so many voxels, and all that follows from them.
+
+    Raises:
+        BadInputError: kind `bad_cell`: they are another cell, or of another map; or as `decode_canonical_cell`.
+        DamagedDataError: they are no canonical cell.
+    """
+    # Decode within the memory that a cell of as many voxels can need: what claims more is another cell.
+    limit_bytes = voxels * (VOXEL_BYTES + 4 + 8 * row.geometry.plane_count)
+    with DECODING.of_cell(row.geometry, voxels):
+        if row.layer.has_epochs:
+            check_canonical_history(data, evidence_bytes_max=limit_bytes)
+        else:
+            decode_canonical_cell(data, evidence_bytes_max=limit_bytes)
+        try:
+            return write_cell(read_cell(data, key, row.layer))
+        except DamagedDataError as exc:  # sound, and so another cell
+            raise BadInputError(
+                "bad_cell", f"the body is no cell {cell_of_key(key)} of map {row.name}: {exc.message}"
+            ) from exc
 
 
 def _row_of(snapshot: Snapshot, key: CellKey) -> CellRow | None:

@@ -13,15 +13,16 @@ import logging
 from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
+from functools import partial
 from typing import NamedTuple, Protocol
 
 from cairn_map.codec.cell_code import DecodedCell
-from cairn_map.commits.commit import commit_sha
+from cairn_map.commits.commit import commit_sha, version_of_meta
 from cairn_map.commits.cursor import ENTRY_FOLD, ENTRY_UNFOLD, Cursor, next_chain
 from cairn_map.commits.ids import CommitId
+from cairn_map.epochs.history_cell import HistoryCell
 from cairn_map.errors import BadInputError, DamagedDataError
 from cairn_map.evidence.blocks import Blocks
-from cairn_map.evidence.brick_cell import BrickCell
 from cairn_map.evidence.grid import CellKey
 from cairn_server.cell_room import voxels_of
 from cairn_server.folding.cell_cache import CellCache, Changed, Step
@@ -292,8 +293,9 @@ class _Plan:
         """Add or subtract a commit's diff, all of it or nothing; returns the blocks of each cell that it touches."""
         if commit.gone:
             raise DamagedCommitError("damaged_store", f"the evidence of commit {commit.id} is not kept any more")
-        # The sums are integers, so that taking a diff back gives exactly the cell of before.
-        step, undo = BrickCell.merge, BrickCell.unmerge
+        # The sums are integers, so that taking a diff back gives exactly the cell of before; and it is taken out of the
+        # epoch that it was added to, whatever came since (rule T6).
+        step, undo = HistoryCell.merge, HistoryCell.unmerge
         if kind == ENTRY_UNFOLD:
             step, undo = undo, step
         # The diffs are applied before their SHA-256 is known: each is decoded once, and taken back if it is wrong.
@@ -303,7 +305,7 @@ class _Plan:
             for key, body in commit.diff.items():
                 done[key], digest = self._change(key, body, step, commit)
                 digests.append(digest)
-            if commit_sha(commit.text, digests) != commit.sha:
+            if commit_sha(commit.text, digests, version=version_of_meta(commit.text)) != commit.sha:
                 raise DamagedCommitError("damaged_store", f"commit {commit.id} at rest does not have its SHA-256")
         except (DamagedCommitError, AwayError):
             for key in done:
@@ -313,7 +315,8 @@ class _Plan:
 
     def _change(self, key: CellKey, body: bytes, step: Step, commit: StoredCommit) -> Changed:
         try:
-            return self.cache.change(key, voxels_of(body), lambda: _decoded(commit, key, body), step, self)
+            read = partial(_decoded, commit, key, body)
+            return self.cache.change(key, voxels_of(body), read, step, self, epoch=commit.epoch)
         except BadInputError as exc:
             raise DamagedCommitError("damaged_store", f"commit {commit.id} at rest: {exc.message}") from exc
 
@@ -328,10 +331,10 @@ class _Plan:
         with self._reading() as snapshot:
             return row_of_cell(snapshot, key)
 
-    def opened(self, key: CellKey, row: CellRow | None) -> tuple[BrickCell, CellStamps]:
+    def opened(self, key: CellKey, row: CellRow | None) -> tuple[HistoryCell, CellStamps]:
         """Cell of a row, to be changed."""
         with self._reading() as snapshot:
-            return cell_to_change(snapshot, key, row, self.map.geometry)
+            return cell_to_change(snapshot, key, row, self.map.layer)
 
 
 def _decoded(commit: StoredCommit, key: CellKey, body: bytes) -> DecodedCell:

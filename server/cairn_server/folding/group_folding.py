@@ -221,7 +221,7 @@ def _touches(store: FoldStore, row: MapRow, commit: StoredCommit, cells: set[Cel
 def _can_be_read(store: FoldStore, row: MapRow, key: CellKey) -> bool:
     try:
         with store.snapshot(row) as snapshot:
-            cell_to_change(snapshot, key, row_of_cell(snapshot, key), row.geometry)
+            cell_to_change(snapshot, key, row_of_cell(snapshot, key), row.layer)
     except (DamagedCellError, AwayError):
         return False
     return True

@@ -2,19 +2,20 @@
 
 history     the newest log entries of a cell                 } of its state at one `lm`; each is made
 stamps      entry that changed each of its blocks            } once for all concurrent requests
-evidence    all of it, decoded: the expensive part           }
+evidence    all of it, decoded, row by row: the costly part  }
 change      frame content for robots at an older entry       }
 """
 
 from dataclasses import dataclass
 
 from cairn_map.commits.ids import Author
+from cairn_map.epochs.cell_history import CellHistory
+from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import DamagedDataError
 from cairn_map.evidence.blocks import Blocks
-from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey, Geometry, cell_of_key
 from cairn_map.wire.frames import FrameKind
-from cairn_server.folding.cells_at_rest import stored_evidence, stored_stamps
+from cairn_server.folding.cells_at_rest import stored_history, stored_stamps
 from cairn_server.folding.single_flight import MadeOnce
 from cairn_server.store.stamps import Stamps
 from cairn_server.store.store import Snapshot
@@ -56,7 +57,7 @@ class ReadCache:
 
     def __init__(self, *, share: float = 1.0) -> None:
         """Make empty caches, each of this part of its standard size."""
-        self._evidence: MadeOnce[State, Evidence] = MadeOnce(
+        self._evidence: MadeOnce[State, CellHistory] = MadeOnce(
             limit_bytes=int(share * EVIDENCE_BYTES), size_of=lambda evidence: evidence.size_bytes
         )
         self._stamps: MadeOnce[State, Stamps] = MadeOnce(
@@ -69,13 +70,13 @@ class ReadCache:
             limit_bytes=int(share * CHANGES_BYTES), size_of=_change_bytes
         )
 
-    def evidence(self, snapshot: Snapshot, listed: CellRow) -> Evidence:
-        """Evidence of a listed cell.
+    def evidence(self, snapshot: Snapshot, listed: CellRow, layer: MapLayer) -> CellHistory:
+        """Evidence of a listed cell, by epoch.
 
         Raises:
             DamagedDataError: kind `damaged_store`: the cell at rest is not sound.
         """
-        return self._evidence.get(state_of(snapshot, listed), lambda: stored_evidence(_stored(snapshot, listed)))
+        return self._evidence.get(state_of(snapshot, listed), lambda: stored_history(_stored(snapshot, listed), layer))
 
     def stamps(self, snapshot: Snapshot, listed: CellRow, geometry: Geometry) -> Stamps:
         """Stamps of a listed cell.

@@ -15,15 +15,16 @@ from itertools import groupby
 
 import numpy as np
 
-from cairn_map.codec.cell_code import DecodedCell
-from cairn_map.commits.commit import commit_sha
+from cairn_map.commits.commit import commit_sha, version_of_meta
 from cairn_map.commits.cursor import ENTRY_FOLD, next_chain
 from cairn_map.commits.version_vector import EMPTY
+from cairn_map.epochs.cell_history import row_fingerprint
+from cairn_map.epochs.epoch import Epoch
 from cairn_map.errors import CairnError, DamagedDataError
-from cairn_map.evidence.fingerprint import ZERO, Fingerprint, fingerprint
+from cairn_map.evidence.fingerprint import ZERO, Fingerprint
 from cairn_map.evidence.grid import CellKey, cell_of_key
 from cairn_map.kernels.morton_kernels import UInts
-from cairn_server.folding.cells_at_rest import decode_stored, rebuilt_cell, stored_evidence
+from cairn_server.folding.cells_at_rest import check_stored, decode_stored, rebuilt_cell
 from cairn_server.store.objects.cold_bytes import AwayError
 from cairn_server.store.store import Snapshot, Store
 from cairn_server.store.store_rows import CellRow, ChainedEntry, MapRow, StoredCommit
@@ -34,6 +35,8 @@ PENDING_BYTES_MAX = 256 << 20
 """Most bytes of the pending commits that are checked; folding checks each of them in any case."""
 Report = Callable[[int, int], None]
 """Callback for progress: steps done, and all steps."""
+KnownDiffs = dict[tuple[bytes, Epoch], Fingerprint]
+"""Fingerprints that diffs add to their cells, by the SHA-256 of their bytes and the epoch of their commit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +78,7 @@ def check_map(store: Store, row: MapRow, report: Report) -> MapCheck:
     with store.snapshot(row) as snapshot:
         keys = [cell.key for cell in snapshot.cells()]
         total = snapshot.totals().commits + len(keys)
-    known: dict[bytes, Fingerprint] = {}
+    known: KnownDiffs = {}
     for commit in _commits(store, row, checked):
         checked.commits += 1
         checked.findings += _of_commit(row, commit, known, checked)
@@ -131,8 +134,10 @@ def _of_sums(snapshot: Snapshot, row: MapRow) -> Iterator[Finding]:
     cells = list(snapshot.cells())
     known = [cell for cell in cells if cell.voxels]
     totals, sizes = snapshot.totals(), sum(cell.size_bytes for cell in known)
+    history_bytes = sum(cell.history_bytes for cell in known)
     corners = corners_of(_numbers({tile_of(cell.key) for cell in known}), lambda _: [cell.key for cell in known])
-    if (totals.cells, totals.size_bytes, totals.corner_cells) != (len(known), sizes, corners):
+    found = totals.cells, totals.size_bytes, totals.history_bytes, totals.corner_cells
+    if found != (len(known), sizes, history_bytes, corners):
         yield Finding(row.name, f"totals: {totals} are not those of its {len(known)} cells", is_sum=True)
     if snapshot.fingerprint_sum() != sum((cell.fingerprint for cell in cells), ZERO):
         yield Finding(row.name, "totals: the fingerprint is not the sum of its cells'", is_sum=True)
@@ -156,9 +161,7 @@ def _log_page(store: Store, row: MapRow, *, after_seq: int) -> list[ChainedEntry
         return snapshot.chained(after_seq=after_seq, limit=PAGE)
 
 
-def _of_commit(
-    row: MapRow, commit: StoredCommit, known: dict[bytes, Fingerprint], checked: MapCheck
-) -> Iterator[Finding]:
+def _of_commit(row: MapRow, commit: StoredCommit, known: KnownDiffs, checked: MapCheck) -> Iterator[Finding]:
     if commit.gone:
         checked.not_kept += 1
         return
@@ -170,12 +173,14 @@ def _of_commit(
             yield Finding(row.name, f"commit {commit.id}: {exc.message}")
             return
         digests.append(decoded.digest)
-        known[hashlib.sha256(body).digest()] = _sums(decoded, key)
-    if commit_sha(commit.text, digests) != commit.sha:
+        known[hashlib.sha256(body).digest(), commit.epoch] = row_fingerprint(
+            decoded.evidence, commit.epoch, key, layer_word=row.layer.word
+        )
+    if commit_sha(commit.text, digests, version=version_of_meta(commit.text)) != commit.sha:
         yield Finding(row.name, f"commit {commit.id} does not have its SHA-256")
 
 
-def _of_cell(snapshot: Snapshot, row: MapRow, key: CellKey, known: dict[bytes, Fingerprint]) -> Iterator[Finding]:
+def _of_cell(snapshot: Snapshot, row: MapRow, key: CellKey, known: KnownDiffs) -> Iterator[Finding]:
     name = cell_of_key(key)
     try:
         stored = snapshot.cell(key)
@@ -187,35 +192,32 @@ def _of_cell(snapshot: Snapshot, row: MapRow, key: CellKey, known: dict[bytes, F
     if stored is None:
         return
     try:
-        stored_evidence(stored)
-        expected = _sum_of_diffs(snapshot, key, known)
+        check_stored(stored, row.layer)
+        expected = _sum_of_diffs(snapshot, row, key, known)
         if stored.gone_seq or expected is None or expected == stored.fingerprint:
             return
         complaint = f"cell {name} is not the sum of its commits"
     except DamagedDataError as exc:
         complaint = exc.message
     try:
-        yield Finding(row.name, complaint, stored, rebuilt_cell(snapshot, stored, row.geometry))
+        yield Finding(row.name, complaint, stored, rebuilt_cell(snapshot, stored, row.layer))
     except DamagedDataError as exc:
         yield Finding(row.name, f"{complaint}; it cannot be rebuilt from the log: {exc.message}", stored)
 
 
-def _sum_of_diffs(snapshot: Snapshot, key: CellKey, known: dict[bytes, Fingerprint]) -> Fingerprint | None:
+def _sum_of_diffs(snapshot: Snapshot, row: MapRow, key: CellKey, known: KnownDiffs) -> Fingerprint | None:
     """Fingerprint of a cell as the log says; None if evidence was dropped or is damaged."""
     total = ZERO
     for entry in snapshot.contributions(key, after_seq=0):
         body = snapshot.diff(entry.commit, key)
         if body is None:
             return None
-        sums = known.get(hashlib.sha256(body).digest())
+        sums = known.get((hashlib.sha256(body).digest(), entry.epoch))
         if sums is None:
             try:
-                sums = _sums(decode_stored(key, body), key)
+                evidence = decode_stored(key, body).evidence
             except DamagedDataError:
                 return None
+            sums = row_fingerprint(evidence, entry.epoch, key, layer_word=row.layer.word)
         total = total + sums if entry.kind == ENTRY_FOLD else total - sums
     return total
-
-
-def _sums(decoded: DecodedCell, key: CellKey) -> Fingerprint:
-    return fingerprint(decoded.evidence, key)

@@ -7,14 +7,14 @@ full    the whole cell                              always
 
 import logging
 
-from cairn_map.codec.cell_code import encode_cell
+from cairn_map.codec.layer_code import encode_layer_cell, row_file
 from cairn_map.commits.cursor import ENTRY_FOLD, Cursor
 from cairn_map.commits.ids import Author
+from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import DamagedDataError
-from cairn_map.evidence.blocks import of_blocks
-from cairn_map.evidence.grid import Geometry, cell_of_key
+from cairn_map.evidence.grid import cell_of_key
 from cairn_map.wire.frames import CellFrame, FrameKind
-from cairn_server.cell_room import DECODING, changed_bytes
+from cairn_server.cell_room import DECODING, changed_bytes, decoded_bytes
 from cairn_server.folding.cells_at_rest import sum_of_contributions
 from cairn_server.folding.read_cache import Change, ChangeName, ReadCache, state_of
 from cairn_server.store.objects.cold_bytes import AwayError
@@ -39,7 +39,7 @@ def change_since(
     snapshot: Snapshot,
     row: CellRow,
     start: Cursor,
-    geometry: Geometry,
+    layer: MapLayer,
     cache: ReadCache,
     *,
     asker: Author | None,
@@ -51,7 +51,7 @@ def change_since(
         snapshot: the state to come to.
         row: the cell, changed after `start`.
         start: the asker's state of the cell; a proven cursor.
-        geometry: of the map.
+        layer: of the map.
         cache: of cells, and of changes made for other askers.
         asker: author whose own commits a delta leaves out.
         kinds: frames that the asker can use.
@@ -71,7 +71,7 @@ def change_since(
     )
     # Made once for all of them.
     summed = foreign if is_told and "delta" in kinds else None
-    change = cache.changes.get(name, lambda: _smallest(snapshot, row, summed, name, geometry, cache))
+    change = cache.changes.get(name, lambda: _smallest(snapshot, row, summed, name, layer, cache))
     if change is None:
         return None
     return CellFrame(
@@ -91,18 +91,18 @@ def _smallest(
     row: CellRow,
     summed: list[Contribution] | None,
     name: ChangeName,
-    geometry: Geometry,
+    layer: MapLayer,
     cache: ReadCache,
 ) -> Change | None:
     """Smaller one of the delta and the state, if it is smaller than the whole cell."""
-    delta = _delta(snapshot, row, summed, geometry) if summed is not None else None
+    delta = _delta(snapshot, row, summed, layer) if summed is not None else None
     smallest = row.size_bytes if delta is None else min(len(delta), row.size_bytes)
     state = None
     # The blocks that one commit touched have all of its voxels and others: their present sums are hardly ever smaller,
     # and cost a decoded cell.
     is_own_sum = delta is not None and summed is not None and len(summed) == 1 and len(delta) < row.size_bytes
     if "state" in name.kinds and not is_own_sum:
-        state = _state(snapshot, row, name.after_seq, geometry, cache, size_bytes_max=smallest)
+        state = _state(snapshot, row, name.after_seq, layer, cache, size_bytes_max=smallest)
     if state is not None:
         return state
     if delta is None or len(delta) >= row.size_bytes:
@@ -110,24 +110,25 @@ def _smallest(
     return Change(FrameKind.DELTA, delta)
 
 
-def _delta(snapshot: Snapshot, row: CellRow, foreign: list[Contribution], geometry: Geometry) -> bytes | None:
-    """Encoded sum of what others did to a cell; None if it would be too large, or a diff is damaged or away."""
+def _delta(snapshot: Snapshot, row: CellRow, foreign: list[Contribution], layer: MapLayer) -> bytes | None:
+    """Encoded sum by epoch of what others did to a cell; None: it would be too large, or a diff is damaged or away."""
     # Diffs that together have four times the cell's bytes hardly sum up to less than the cell.
     if sum(entry.size_bytes for entry in foreign) > 4 * row.size_bytes:
         return None
     if len(foreign) == 1 and foreign[0].kind == ENTRY_FOLD:
         try:
-            return snapshot.diff(foreign[0].commit, row.key) or None  # its own sum; empty: its segment is lost
+            diff = snapshot.diff(foreign[0].commit, row.key)  # its own sum
+            return row_file(diff, foreign[0].epoch, row.key, layer) if diff else None  # empty: its segment is lost
         except AwayError:
             return None
     # Of several commits: decoded and added up, one cell at a time in the room that all requests share.
-    size_bytes = changed_bytes(geometry, row.voxels)
+    size_bytes = changed_bytes(layer.geometry, row.voxels, rows=len({entry.epoch for entry in foreign}))
     if size_bytes > DECODING.limit_bytes:
         return None
     try:
         with DECODING.of(size_bytes):
-            evidence = sum_of_contributions(snapshot, row.key, foreign, geometry).packed()
-            return encode_cell(row.key, evidence, geometry).data if len(evidence) else b""
+            history = sum_of_contributions(snapshot, row.key, foreign, layer).history()
+            return encode_layer_cell(row.key, history, layer).data if len(history) else b""
     except AwayError:
         return None
     except DamagedDataError as exc:
@@ -136,25 +137,27 @@ def _delta(snapshot: Snapshot, row: CellRow, foreign: list[Contribution], geomet
 
 
 def _state(
-    snapshot: Snapshot, row: CellRow, after_seq: int, geometry: Geometry, cache: ReadCache, *, size_bytes_max: int
+    snapshot: Snapshot, row: CellRow, after_seq: int, layer: MapLayer, cache: ReadCache, *, size_bytes_max: int
 ) -> Change | None:
-    """Frame of the changed blocks' present sums, if it can have less than `size_bytes_max` and the cell is here."""
+    """Frame of the changed blocks' present rows, if it can have less than `size_bytes_max` and the cell is here."""
     try:
         # Estimate from the stamps alone whether it can be small enough, before the cell is decoded.
-        stamps = cache.stamps(snapshot, row, geometry)
+        stamps = cache.stamps(snapshot, row, layer.geometry)
         blocks, known = blocks_after(stamps, after_seq), int((stamps > 0).sum())
         if len(blocks) > STATE_SHARE_MAX * known or BLOCK_NUMBER_BYTES * len(blocks) >= size_bytes_max:
             return None
         if STATE_HEAD_BYTES + row.size_bytes * len(blocks) / max(known, 1) > size_bytes_max:
             return None
+        if decoded_bytes(layer.geometry, row.voxels) > DECODING.limit_bytes:
+            return None
         # Last, since it is expensive. All take room before they ask the cache: its maker has it, too.
-        with DECODING.of_cell(geometry, row.voxels):
-            changed = of_blocks(cache.evidence(snapshot, row), blocks)
+        with DECODING.of_cell(layer.geometry, row.voxels):
+            changed = cache.evidence(snapshot, row, layer).of_blocks(blocks)
     except AwayError:
         return None
     except DamagedDataError as exc:
         log.error("cell %s: %s; no changed blocks of it", cell_of_key(row.key), exc.message)
         return None
-    payload = encode_cell(row.key, changed, geometry).data
+    payload = encode_layer_cell(row.key, changed, layer).data
     is_smaller = len(payload) + BLOCK_NUMBER_BYTES * len(blocks) < size_bytes_max
     return Change(FrameKind.STATE, payload, blocks) if is_smaller else None

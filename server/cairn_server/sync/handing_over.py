@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 
-from cairn_map.commits.commit import CommitMeta, commit_bytes
+from cairn_map.commits.commit import CommitMeta, commit_bytes, version_of_meta
 from cairn_map.commits.ids import OPERATOR, SERVERS_OWN, commit_id_from_text
 from cairn_map.commits.signature import Signature, SigningKey, signatures_to_text, speaks_for
 from cairn_map.errors import ConflictError, DeniedError, NotFoundError, UnreachableError
@@ -90,7 +90,7 @@ def found_commit(store: Store, row: MapRow, id_text: str) -> FoundCommit:
     if robot in SERVERS_OWN:
         signatures = signatures_to_text([server_key(row).sign(row.name, found.sha)])
     return FoundCommit(
-        data=commit_bytes(found.text, dict(sorted(found.diff.items()))),
+        data=commit_bytes(found.text, dict(sorted(found.diff.items())), version=version_of_meta(found.text)),
         sha=found.sha,
         seal=seal_of(row, found.sha) if robot == OPERATOR else None,
         signatures=signatures,

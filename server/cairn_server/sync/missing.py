@@ -18,10 +18,11 @@ import numpy.typing as npt
 from cairn_map.commits.cursor import Cursor, cursor_from_text
 from cairn_map.commits.ids import OPERATOR, Author, CommitId, author_from_text
 from cairn_map.commits.version_vector import EMPTY, VersionVector
+from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import ConflictError
 from cairn_map.evidence.cell_order import first_to_last
 from cairn_map.evidence.fingerprint import ZERO, Fingerprint
-from cairn_map.evidence.grid import CELL_LIMIT, Cell, CellKey, Geometry, cell_key, cell_of_key
+from cairn_map.evidence.grid import CELL_LIMIT, Cell, CellKey, cell_key, cell_of_key
 from cairn_map.kernels.morton_kernels import UInts, deinterleave
 from cairn_map.wire.empty_cell_frames import EmptyCellFrames
 from cairn_map.wire.frames import CellFrame, Frame, FrameKind
@@ -186,7 +187,7 @@ class CellFrames:
 
     snapshot: Snapshot
     query: MissingQuery
-    geometry: Geometry
+    layer: MapLayer
     cache: ReadCache
     faults: CellFaults
     """Cells met on the way that are damaged, or away; filled here."""
@@ -218,7 +219,7 @@ class CellFrames:
         if start is not None:
             query = self.query
             change = change_since(
-                self.snapshot, row, start, self.geometry, self.cache, asker=query.author, kinds=query.kinds
+                self.snapshot, row, start, self.layer, self.cache, asker=query.author, kinds=query.kinds
             )
             if change is not None:
                 return change
@@ -236,12 +237,12 @@ class CellFrames:
         else:
             return None
         to = self.snapshot.head
-        return EmptyCellFrames(kind=kind, cells=keys, from_cursor=start, to_cursor=to, geometry=self.geometry)
+        return EmptyCellFrames(kind=kind, cells=keys, from_cursor=start, to_cursor=to, layer=self.layer)
 
     def _body(self, key: CellKey) -> bytes:
         """A cell's bytes; empty if they are lost, which the asker reports while it gets all other cells."""
         try:
-            stored = sound_cell(self.snapshot, key, self.geometry, self.faults.healed)
+            stored = sound_cell(self.snapshot, key, self.layer, self.faults.healed)
         except DamagedCellError as exc:
             self.faults.damaged.add(key)
             log.error("cell %s is sent without its bytes: %s", cell_of_key(key), exc.message)

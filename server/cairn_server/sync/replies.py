@@ -69,7 +69,7 @@ class MainReplies:
         # which holds up the emptying of the store's log.
         with self._cells.reading(row) as faults, self._store.snapshot(row) as snapshot:
             query = query_of(asked, snapshot)
-            cells = CellFrames(snapshot, query, row.geometry, self._cache, faults)
+            cells = CellFrames(snapshot, query, row.layer, self._cache, faults)
             frames = without_begun(reply_frames(cells, self._facts(row, snapshot)), asked.request.begun)
             reply = b"".join([start_of_reply(), *_encoded(self._figures.counted(frames))])
         # For the list of branches and their expiry: what the server sends never depends on it.

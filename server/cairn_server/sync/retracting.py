@@ -127,8 +127,14 @@ def _selection(request: Retract) -> Selection:
 def _builder(row: MapRow, author: Author, targets: list[CommitId], note: str) -> Callable[[int], NewCommit]:
     def build(n: int) -> NewCommit:
         names = tuple(map(str, targets))
-        meta = CommitMeta(id=str(CommitId(author, n)), geometry=row.geometry.digest().hex(), retracts=names, note=note)
-        commit = make_commit(meta, {}, row.geometry)
+        meta = CommitMeta(
+            id=str(CommitId(author, n)),
+            geometry=None if row.layer.has_epochs else row.geometry.digest().hex(),
+            layers=row.layer.identities,
+            retracts=names,
+            note=note,
+        )
+        commit = make_commit(meta, {}, row.layer)
         return NewCommit(
             id=commit.id,
             sha=commit.sha,

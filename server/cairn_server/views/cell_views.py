@@ -12,20 +12,31 @@ import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
+from cairn_map.codec.cell_code import encode_cell
+from cairn_map.codec.layer_code import encode_layer_cell
 from cairn_map.codec.view_code import VERSION, encode_view
+from cairn_map.epochs.cell_history import history_fingerprint
 from cairn_map.errors import BadInputError, DamagedDataError, NotFoundError
+from cairn_map.evidence.fingerprint import Fingerprint, fingerprint
 from cairn_map.evidence.grid import CellKey, Geometry, cell_of_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
-from cairn_map.evidence.view import ViewStyle
+from cairn_map.evidence.view import FULL_STYLE, Extent, ViewStyle
 from cairn_map.files.cell_files import CELL_MEDIA_TYPE, MEDIA_TYPES, cell_file
 from cairn_server.cell_room import DECODING
 from cairn_server.folding.cells import Cells
-from cairn_server.folding.cells_at_rest import stored_evidence, stored_surfaces
+from cairn_server.folding.cells_at_rest import stored_history
 from cairn_server.store.store import Store
 from cairn_server.store.store_rows import CellRow, Head, MapRow
+from cairn_server.views.readings import (
+    moment_name,
+    past_rows,
+    reading_at,
+    stored_reading,
+    stored_surface_reading,
+)
 
 BYTES_MAX = 1 << 26
 """Most bytes of all views kept; 56 cells of 4 cm have 2 MB of views at their voxels, 3 MB at all depths."""
@@ -35,9 +46,37 @@ LOOKED_AT_S = 600.0
 """Time for which a map counts as looked at, after a page asked for a view of it."""
 FILE_VOXELS_MAX = 1 << 20
 """Known voxels of a cell that is made into an NPZ or PLY file: some 330 bytes of memory each."""
+TOTAL = "total"
+"""Form of a cell of a map with epochs: the sum of its rows, as a cell of version 1."""
 BUNDLE_MEDIA_TYPE = "application/vnd.cairn.views"
 BUNDLE_CELLS_MAX = 10_000
 BUNDLE_BYTES_MAX = 8 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class CellForm:
+    """Form of a cell that a client asks for; by default the octree as it is."""
+
+    suffix: str = ""
+    """Suffix of a file, or `TOTAL`."""
+    depth: int | None = None
+    """Octree depth of a view; None: another form is asked for."""
+    at_s: float | None = None
+    """Time at which the cell is read, UTC seconds since 1970; None: now."""
+    is_known: bool = False
+    """True for a view of all known nodes, with log-odds: a robot shows it while the rows are on their way."""
+
+    @property
+    def style(self) -> ViewStyle:
+        """Style of a view in this form."""
+        if self.is_known:
+            return replace(FULL_STYLE, depth=self.depth, extent=Extent.KNOWN)
+        return ViewStyle(depth=self.depth)
+
+    @property
+    def media_type(self) -> str:
+        """Media type of its bytes."""
+        return MEDIA_TYPES["view"] if self.depth is not None else MEDIA_TYPES.get(self.suffix, CELL_MEDIA_TYPE)
 
 
 def first_depth(depth: int) -> int:
@@ -61,11 +100,14 @@ def _style_digest(geometry: Geometry, model: SensorModel) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def cell_etag(row: MapRow, stored: CellRow, suffix: str, depth: int | None) -> str:
-    """Strong ETag of a cell: of its octree (no suffix, no depth) by its digest, of any other form by the style, too."""
-    if depth is not None:
-        suffix = f"view.{depth}"
-    return f'"{stored.digest.hex()}.{suffix}.{style_digest(row)}"' if suffix else f'"{stored.digest.hex()}"'
+def cell_etag(row: MapRow, stored: CellRow, form: CellForm) -> str:
+    """Strong ETag of a cell: of its octree by its digest, of any other form by the style and the time, too."""
+    name = form.suffix if form.depth is None else f"view.{form.depth}"
+    if form.is_known:
+        name += ".known"
+    if form.at_s is not None:
+        name += f".{moment_name(row, form.at_s)}"
+    return f'"{stored.digest.hex()}.{name}.{style_digest(row)}"' if name else f'"{stored.digest.hex()}"'
 
 
 def is_same(etag: str, if_none_match: str | None) -> bool:
@@ -83,9 +125,9 @@ def view_of_stored(row: MapRow, stored: CellRow, depth: int) -> bytes:
         DamagedDataError: kind `damaged_store`: its bytes are not sound.
     """
     # Voxels without a hit have a probability below a half: a view that does not show them can leave out most of a cell.
-    read = stored_surfaces if row.sensor_model.p_occupied >= 0.5 else stored_evidence
+    read = stored_surface_reading if row.sensor_model.p_occupied >= 0.5 else stored_reading
     with DECODING.of_cell(row.geometry, stored.voxels):
-        return encode_view(stored.key, read(stored), row.geometry, row.sensor_model, style=ViewStyle(depth=depth))
+        return encode_view(stored.key, read(stored, row), row.geometry, row.sensor_model, style=ViewStyle(depth=depth))
 
 
 class ViewCache:
@@ -156,6 +198,8 @@ class CellAnswer:
     etag: str
     data: bytes | None
     """Bytes in the form asked for; None: the client has them, by its `If-None-Match`."""
+    fingerprint: Fingerprint | None
+    """Fingerprint of the octree; None if the octree asked for is not the stored one, and is not made."""
 
 
 class CellViews:
@@ -166,23 +210,22 @@ class CellViews:
         self._cells = cells
         self.cache = ViewCache()
 
-    def asked(
-        self, row: MapRow, key: CellKey, suffix: str, depth: int | None, *, known: str | None = None
-    ) -> CellAnswer:
-        """One cell: its octree, a file by suffix, or (with a depth) a view; without data if `known` names its ETag.
+    def asked(self, row: MapRow, key: CellKey, form: CellForm, *, known: str | None = None) -> CellAnswer:
+        """One cell in some form; without data if `known` names its ETag.
 
         Raises:
             NotFoundError: kind `no_cell`: it was never seen.
             BadInputError: kind `too_costly`: the file would be too large to be made in memory.
+            ConflictError: kind `not_known`: evidence of that time is not kept apart any more.
             DamagedCellError: kind `damaged_store`: it is damaged and cannot be rebuilt.
         """
-        if depth is not None:
+        if form.depth is not None:
             self.cache.note_look(row.number)
             try:
-                return self._answer(row, key, self._cells.unchecked(row, key), suffix, depth, known)
+                return self._answer(row, key, self._cells.unchecked(row, key), form, known)
             except DamagedDataError:
                 pass  # rebuilt from the log below, if that is possible
-        return self._answer(row, key, self._cells.sound(row, key), suffix, depth, known)
+        return self._answer(row, key, self._cells.sound(row, key), form, known)
 
     def ready(self, row: MapRow) -> tuple[int, bytes]:
         """Octree depth of a page's first views, and those that are ready, in one answer.
@@ -195,6 +238,7 @@ class CellViews:
         Nothing is made for it: 15 us a cell. Views that are missing are asked for by cell.
         """
         depth = first_depth(row.geometry.depth)
+        form = CellForm("view", depth)
         self.cache.note_look(row.number)
         with self._store.snapshot(row) as snapshot:
             cells = [cell for cell in snapshot.cells(limit=BUNDLE_CELLS_MAX) if cell.voxels]
@@ -203,7 +247,7 @@ class CellViews:
             view = self.cache.ready(view_name(row, cell, depth))
             if view is None:
                 continue
-            head = json.dumps({"cell": cell_of_key(cell.key), "etag": cell_etag(row, cell, "view", depth)}).encode()
+            head = json.dumps({"cell": cell_of_key(cell.key), "etag": cell_etag(row, cell, form)}).encode()
             if len(found) + 8 + len(head) + len(view) > BUNDLE_BYTES_MAX:
                 break
             for part in (head, view):
@@ -211,40 +255,76 @@ class CellViews:
         return depth, bytes(found)
 
     def _answer(
-        self,
-        row: MapRow,
-        key: CellKey,
-        found: tuple[CellRow | None, Head],
-        suffix: str,
-        depth: int | None,
-        known: str | None,
+        self, row: MapRow, key: CellKey, found: tuple[CellRow | None, Head], form: CellForm, known: str | None
     ) -> CellAnswer:
         stored, head = found
         if stored is None:
             raise NotFoundError(
                 "no_cell", f"no robot has seen cell {','.join(map(str, cell_of_key(key)))} of map {row.name}"
             )
-        etag = cell_etag(row, stored, suffix, depth)
-        data = None if is_same(etag, known) else self._data(row, stored, suffix, depth)
-        return CellAnswer(stored, head, etag, data)
+        etag = cell_etag(row, stored, form)
+        is_octree = form.depth is None and form.suffix in ("", TOTAL)
+        fingerprint = None if is_octree and form != CellForm() else stored.fingerprint
+        if is_same(etag, known):
+            return CellAnswer(stored, head, etag, None, fingerprint)
+        if fingerprint is None:
+            return CellAnswer(stored, head, etag, *self._octree(row, stored, form))
+        return CellAnswer(stored, head, etag, self._data(row, stored, form), fingerprint)
 
-    def _data(self, row: MapRow, stored: CellRow, suffix: str, depth: int | None) -> bytes:
-        if depth is not None:
-            return self.cache.view(view_name(row, stored, depth), lambda: view_of_stored(row, stored, depth))
-        if not suffix:
+    def _data(self, row: MapRow, stored: CellRow, form: CellForm) -> bytes:
+        """The octree as it is stored, a file, or a view."""
+        if form == CellForm():
             return stored.body
-        if suffix != "view" and stored.voxels > FILE_VOXELS_MAX:
-            raise BadInputError(
-                "too_costly",
-                f"a cell of at most {FILE_VOXELS_MAX} known voxels comes as .{suffix[:16]}, this one has "
-                f"{stored.voxels}; take the cell itself, or an export of its box, which is made piece by piece",
-            )
+        if form.depth is not None and not form.is_known:
+            return self._view(row, stored, form, form.depth)
+        # Of a cell with epochs the voxels are counted in each row, and it is read as one.
+        if not row.layer.has_epochs:
+            _check_file(form, stored.voxels)
         with DECODING.of_cell(row.geometry, stored.voxels):
-            return cell_file(suffix, stored.key, stored_evidence(stored), row.geometry, row.sensor_model)[0]
+            evidence = reading_at(self._store, stored, row, form.at_s)
+            if form.is_known:
+                return encode_view(stored.key, evidence, row.geometry, row.sensor_model, style=form.style)
+            _check_file(form, len(evidence))
+            return cell_file(form.suffix, stored.key, evidence, row.geometry, row.sensor_model)[0]
+
+    def _view(self, row: MapRow, stored: CellRow, form: CellForm, depth: int) -> bytes:
+        """View at an octree depth."""
+        name, until_s = view_name(row, stored, depth), form.at_s
+        if until_s is None:
+            return self.cache.view(name, lambda: view_of_stored(row, stored, depth))
+
+        def make() -> bytes:
+            with DECODING.of_cell(row.geometry, stored.voxels):
+                evidence = reading_at(self._store, stored, row, until_s)
+                return encode_view(stored.key, evidence, row.geometry, row.sensor_model, style=form.style)
+
+        return self.cache.view(f"{name}/{moment_name(row, until_s)}", make)
+
+    def _octree(self, row: MapRow, stored: CellRow, form: CellForm) -> tuple[bytes, Fingerprint]:
+        """Rows up to a time, or the sum of them as a cell of version 1, and the fingerprint of these bytes."""
+        key, layer = stored.key, row.layer
+        with DECODING.of_cell(row.geometry, stored.voxels):
+            if form.at_s is None:
+                history = stored_history(stored, layer)
+            else:
+                with self._store.snapshot(row) as snapshot:
+                    history = past_rows(snapshot, stored, row, form.at_s)
+            if form.suffix == TOTAL:
+                total = history.total(row.geometry)
+                return encode_cell(key, total, row.geometry).data, fingerprint(total, key)
+            found = history_fingerprint(history, key, layer_word=layer.word)
+            return encode_layer_cell(key, history, layer).data, found
 
 
-def media_type_of(suffix: str, depth: int | None) -> str:
-    """Media type of a cell in this form."""
-    if depth is not None:
-        return MEDIA_TYPES["view"]
-    return MEDIA_TYPES[suffix] if suffix else CELL_MEDIA_TYPE
+def _check_file(form: CellForm, voxels: int) -> None:
+    """Refuse a file of more voxels than are made into one in memory.
+
+    Raises:
+        BadInputError: kind `too_costly`.
+    """
+    if form.suffix != "view" and voxels > FILE_VOXELS_MAX:
+        raise BadInputError(
+            "too_costly",
+            f"a cell of at most {FILE_VOXELS_MAX} known voxels comes as .{form.suffix[:16]}, this one has {voxels}; "
+            "take the cell itself, or an export of its box, which is made piece by piece",
+        )

@@ -19,6 +19,7 @@ from functools import cached_property
 from typing import IO
 
 from cairn_map.commits.cursor import Cursor
+from cairn_map.epochs.moment import time_from_text
 from cairn_map.errors import BadInputError, CairnError, DeniedError, UnreachableError
 from cairn_map.evidence.evidence import Evidence, empty_evidence
 from cairn_map.evidence.grid import CellKey
@@ -37,9 +38,10 @@ from cairn_map.files.point_clouds import (
 from cairn_server.access.cancellation import CANCELLATION
 from cairn_server.cell_room import DECODING, voxels_of
 from cairn_server.folding.cells import Cells
-from cairn_server.folding.cells_at_rest import DamagedCellError, decode_stored, sound_cell, stored_evidence
+from cairn_server.folding.cells_at_rest import DamagedCellError, sound_cell
 from cairn_server.store.store import Snapshot, Store
 from cairn_server.store.store_rows import CellRow, MapRow
+from cairn_server.views.readings import body_and_reading, reading_of_body
 
 log = logging.getLogger(__name__)
 
@@ -135,7 +137,7 @@ class _PointFile:
     unseen_cells = ()
 
     def __init__(self, row: MapRow, asked: ExportRequest) -> None:
-        self.row, self.asked = row, asked
+        self.row, self.asked, self.until_s = row, asked, _until_s(asked)
         self._found = PointBounds()
         self._about = About(row.name, node_geometry(row.geometry, asked).voxel_edge_m)
 
@@ -160,7 +162,8 @@ class _PointFile:
     def _points(self, key: CellKey, body: bytes) -> Table:
         geometry, model = self.row.geometry, self.row.sensor_model
         with DECODING.of_cell(geometry, voxels_of(body)):
-            return points_of_cell(key, decode_stored(key, body).evidence, geometry, model, self.asked)
+            evidence = reading_of_body(key, body, self.row)
+            return points_of_cell(key, evidence, geometry, model, self.asked)
 
 
 class _TreeFile:
@@ -169,7 +172,7 @@ class _TreeFile:
     size_bytes = None
 
     def __init__(self, row: MapRow, asked: ExportRequest) -> None:
-        self.row, self.asked = row, asked
+        self.row, self.asked, self.until_s = row, asked, _until_s(asked)
         self.unseen_cells = cells_at_border(row.geometry, row.sensor_model, asked)
         self._roots: list[Nodes] = []
 
@@ -230,10 +233,10 @@ def _laid_aside(
             raise BadInputError("too_costly", f"counting the points takes more than {COUNT_S:g} s; ask for a box")
         with DECODING.of_cell(row.geometry, known):
             if known:
-                stored = sound_cell(snapshot, key, row.geometry, healed)
+                stored = sound_cell(snapshot, key, row.layer, healed)
                 if stored is None:
                     raise DamagedCellError(key, "a cell is listed, but is not there")
-                kept = file.kept(key, stored.body, stored_evidence(stored))
+                kept = file.kept(key, *body_and_reading(snapshot, stored, row, file.until_s))
             else:
                 kept = file.kept(key, b"", empty_evidence(row.geometry))
         if until_s == math.inf:
@@ -242,6 +245,10 @@ def _laid_aside(
             aside.write(kept)
             sizes.append((key, len(kept)))
     return sizes
+
+
+def _until_s(asked: ExportRequest) -> float | None:
+    return None if asked.at is None else time_from_text(asked.at)
 
 
 def _bodies(aside: IO[bytes], sizes: list[tuple[CellKey, int]]) -> Iterator[tuple[CellKey, bytes]]:

@@ -18,8 +18,9 @@ import numpy as np
 
 from cairn_map.arrays import Ints
 from cairn_map.commits.cursor import Cursor
+from cairn_map.epochs.moment import time_from_text
 from cairn_map.errors import BadInputError, DamagedDataError, UnreachableError
-from cairn_map.evidence.brick_cell import brick_cell
+from cairn_map.evidence.brick_cell import brick_cell, reading_cell
 from cairn_map.evidence.grid import CellKey, cell_of_key
 from cairn_map.render.camera_rays import cells_in_sight
 from cairn_map.render.map_picture import Ages, arrays_of, layer_picture, layer_values, npz_of
@@ -31,12 +32,13 @@ from cairn_map.warm_up import warm_up_pictures
 from cairn_server.access.cancellation import CANCELLATION, Cancellation
 from cairn_server.cell_room import DECODING
 from cairn_server.folding.cells import Cells
-from cairn_server.folding.cells_at_rest import DamagedCellError, row_of_cell, sound_cell, stored_evidence
+from cairn_server.folding.cells_at_rest import DamagedCellError, row_of_cell, sound_cell
 from cairn_server.folding.read_cache import State, state_of
 from cairn_server.folding.single_flight import MadeOnce
 from cairn_server.store.stamps import Stamps, decode_stamps, no_stamps
 from cairn_server.store.store import Snapshot, Store
 from cairn_server.store.store_rows import CellRow, MapRow
+from cairn_server.views.readings import moment_name, past_reading, stored_reading
 
 log = logging.getLogger(__name__)
 
@@ -57,6 +59,8 @@ LISTS_BYTES = 64 << 20
 LISTED_BYTES = 500
 TIMES_MAX = 100_000
 Listing = tuple[dict[CellKey, CellRow], Ints]
+CellName = tuple[State, Layer, str | None]
+"""State of a cell, layer in which it is drawn, and time at which it is read; None: now."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,16 +78,24 @@ class _Task:
 
     snapshot: Snapshot
     row: MapRow
+    until_s: float | None
+    """Time at which the map is read, UTC seconds since 1970; None: now."""
     layer: Layer
     """Layer whose values are read from cells; depths and ages need none."""
     listed: dict[CellKey, CellRow]
     """Cells of the snapshot that hold something."""
-    until_s: float
+    end_s: float
+    """Steady time at which the picture must be ready."""
     cancellation: Cancellation
     healed: list[CellRow]
     """Collects the cells that were rebuilt from the log."""
     voxels: int = 0
     """Voxels of the cells read so far."""
+
+    def name_of(self, key: CellKey) -> CellName:
+        """Key of a cell that is ready for this picture, among those of all pictures."""
+        moment = None if self.until_s is None else moment_name(self.row, self.until_s)
+        return state_of(self.snapshot, self.listed[key]), self.layer, moment
 
     def check_time(self) -> None:
         """End what takes too long, or is not wanted any more.
@@ -93,7 +105,7 @@ class _Task:
             UnreachableError: kind `shutting_down`.
         """
         self.cancellation.check()
-        if time.monotonic() > self.until_s:
+        if time.monotonic() > self.end_s:
             raise BadInputError(
                 "too_costly", f"the picture takes more than {RENDER_S:g} s; ask for fewer pixels, or less range_m"
             )
@@ -107,7 +119,7 @@ class MapViews:
         self._store = store
         self._cells = cells
         self._room = threading.BoundedSemaphore(RENDERS_AT_ONCE)
-        self._read_cells: MadeOnce[tuple[State, Layer], ReadCell] = MadeOnce(
+        self._read_cells: MadeOnce[CellName, ReadCell] = MadeOnce(
             limit_bytes=int(cache_share * CELLS_BYTES), size_of=lambda read: read.size_bytes
         )
         self._lists: MadeOnce[Cursor, Listing] = MadeOnce(
@@ -126,15 +138,16 @@ class MapViews:
             DamagedCellError: kind `damaged_store`: a cell in sight is damaged.
         """
         _get_ready()
+        until_s = None if request.at is None else time_from_text(request.at)
         with self._cells.reading(row) as faults, self._store.snapshot(row) as snapshot:
             etag = _etag(snapshot.head, request)
             if known is not None and etag in known:
                 return AskedView(etag, snapshot.head, None)
             with self._turn():
-                until_s = time.monotonic() + RENDER_S
+                end_s = time.monotonic() + RENDER_S
                 listed, places = self._listing(snapshot)
                 layer, cancellation = _read_of(request.layer), CANCELLATION.get()
-                task = _Task(snapshot, row, layer, listed, until_s, cancellation, faults.healed)
+                task = _Task(snapshot, row, until_s, layer, listed, end_s, cancellation, faults.healed)
                 return AskedView(etag, snapshot.head, self._body(task, places, request))
 
     @contextmanager
@@ -165,7 +178,7 @@ class MapViews:
                 "too_large", f"{inside.sum()} cells are in sight, {CELLS_IN_VIEW_MAX} at most may be; lower range_m"
             )
         keys = [key for key, is_inside in zip(task.listed, inside, strict=True) if is_inside]
-        kept = {key: self._read_cells.here((state_of(task.snapshot, task.listed[key]), task.layer)) for key in keys}
+        kept = {key: self._read_cells.here(task.name_of(key)) for key in keys}
         here = {key: read for key, read in kept.items() if read is not None}
         renderer = MapRenderer(threads=THREADS, on_share=task.check_time)
         drawing = draw_as_needed(
@@ -201,8 +214,7 @@ class MapViews:
         stored = {key: row_of_cell(task.snapshot, key) for key in wanted}
 
         def make(key: CellKey) -> ReadCell:
-            state = state_of(task.snapshot, task.listed[key])
-            return self._read_cells.get((state, task.layer), lambda: _ready(stored[key], task))
+            return self._read_cells.get(task.name_of(key), lambda: _ready(stored[key], task))
 
         found: dict[CellKey, ReadCell] = {}
         with ThreadPoolExecutor(THREADS) as pool:
@@ -211,7 +223,7 @@ class MapViews:
             try:
                 found[key] = made.result()
             except DamagedDataError:
-                sound = sound_cell(task.snapshot, key, task.row.geometry, task.healed)
+                sound = sound_cell(task.snapshot, key, task.row.layer, task.healed)
                 found[key] = _ready(sound, task)
         return found
 
@@ -224,9 +236,11 @@ class MapViews:
         slots = np.unique(drawing.seen.slots[drawing.seen.hit]).tolist()
         stamps = {key: self._stamps(task, key) for key in (drawing.snapshot.frozen.keys[slot] for slot in slots)}
         entries = {int(seq) for each in stamps.values() for seq in np.unique(each)} - {0}
-        newest_s = task.snapshot.newest_captured_s()
+        newest_s = task.snapshot.newest_captured_s() if task.until_s is None else task.until_s
         times = {seq: self._time_of(task, seq) for seq in sorted(entries)}
         numbers, moments = np.array([0, *times]), np.array([np.nan, *times.values()])
+        # Of what changed since the time that is shown, the age then is unknown.
+        moments[moments > (np.inf if task.until_s is None else task.until_s)] = np.nan
         changes = {key: moments[np.searchsorted(numbers, each)] for key, each in stamps.items()}
         return Ages(changes, now=np.nan if newest_s is None else newest_s)
 
@@ -290,10 +304,16 @@ def _ready(stored: CellRow | None, task: _Task) -> ReadCell:
         raise DamagedDataError("damaged_store", "a cell is listed, but is not there")
     geometry, model = task.row.geometry, task.row.sensor_model
     with DECODING.of_cell(geometry, stored.voxels):
-        return read_cell(brick_cell(geometry, [stored_evidence(stored)]), geometry, model, task.layer)
+        if task.until_s is None:
+            evidence = stored_reading(stored, task.row)
+        else:
+            evidence = past_reading(task.snapshot, stored, task.row, task.until_s)
+        is_sum = evidence.odds is None
+        cell = brick_cell(geometry, [evidence]) if is_sum else reading_cell(geometry, evidence, model)
+        return read_cell(cell, geometry, model, task.layer)
 
 
 def _etag(head: Cursor, request: RenderRequest) -> str:
     """Strong: the same map and the same request give the same bytes."""
-    text = f"{VERSION} {head} {request.model_dump_json()}"
+    text = f"{VERSION} {head} {request.model_dump_json(exclude={'at'})}" + (f" {request.at}" if request.at else "")
     return f'"{hashlib.sha256(text.encode()).hexdigest()[:32]}"'

@@ -20,9 +20,10 @@ from cairn_map.wire.messages import LogEntry
 from cairn_map.wire.voxel_messages import ChannelReading, VoxelAnswer, VoxelCommit
 from cairn_server.cell_room import DECODING, voxels_of
 from cairn_server.folding.cells import Cells
-from cairn_server.folding.cells_at_rest import decode_stored, sound_cell, stored_evidence
+from cairn_server.folding.cells_at_rest import decode_stored, sound_cell
 from cairn_server.store.store import Snapshot, Store
 from cairn_server.store.store_rows import MapRow
+from cairn_server.views.readings import past_reading, stored_reading, was_captured
 
 ENTRIES_MAX = 32
 """Most of the cell's newest log entries that are decoded, some 10 ms each."""
@@ -45,11 +46,12 @@ def voxel_at(geometry: Geometry, text: str) -> str:
     return ",".join(map(str, voxel.tolist()))
 
 
-def asked_voxel(store: Store, cells: Cells, row: MapRow, text: str) -> VoxelAnswer:
-    """Report on the voxel `i,j,k` of the map's lattice (FORMAT.md 2).
+def asked_voxel(store: Store, cells: Cells, row: MapRow, text: str, *, at_s: float | None = None) -> VoxelAnswer:
+    """Report on the voxel `i,j,k` of the map's lattice (FORMAT.md 2), now or as it was at a time.
 
     Raises:
         BadInputError: kind `bad_cell` or `cell_range`: no voxel is numbered so.
+        ConflictError: kind `not_known`: evidence of that time is not kept apart any more.
         NotFoundError: kind `no_cell`: its cell was never seen.
     """
     found = VOXEL.fullmatch(text)
@@ -61,13 +63,14 @@ def asked_voxel(store: Store, cells: Cells, row: MapRow, text: str) -> VoxelAnsw
     key = cell_key(cell)
     place = int(split_voxels(np.array([voxel]), row.geometry)[1][0])
     with cells.reading(row) as faults, store.snapshot(row) as snapshot:
-        stored = sound_cell(snapshot, key, row.geometry, faults.healed)
+        stored = sound_cell(snapshot, key, row.layer, faults.healed)
         if stored is None:
             raise NotFoundError("no_cell", f"no robot has seen cell {','.join(map(str, cell))} of map {row.name}")
-        commits, more = _commits(snapshot, key, place, row.geometry)
+        commits, more = _commits(snapshot, key, place, row, at_s)
         cursor = snapshot.head
-    with DECODING.of_cell(row.geometry, stored.voxels):
-        seen = _only(stored_evidence(stored), place)
+        with DECODING.of_cell(row.geometry, stored.voxels):
+            evidence = stored_reading(stored, row) if at_s is None else past_reading(snapshot, stored, row, at_s)
+            seen = _only(evidence, place)
     voxels = voxels_of_evidence(key, seen, row.geometry, row.sensor_model, occupied_only=False)
     x, y, z = centres_of_voxels(np.array([voxel]), row.geometry)[0].tolist()
     return VoxelAnswer(
@@ -112,14 +115,19 @@ def _reading(reading: Reading, channel: Channel) -> ChannelReading:
     )
 
 
-def _commits(snapshot: Snapshot, key: CellKey, place: int, geometry: Geometry) -> tuple[list[VoxelCommit], bool]:
-    """Commits that saw a voxel, the newest first; and True if the cell has older ones."""
+def _commits(
+    snapshot: Snapshot, key: CellKey, place: int, row: MapRow, at_s: float | None
+) -> tuple[list[VoxelCommit], bool]:
+    """Commits that saw a voxel, up to a time, the newest first; and True if the cell has older ones."""
     found = snapshot.contributions(key, after_seq=0, newest=ENTRIES_MAX + 1)
+    is_more = len(found) > ENTRIES_MAX
+    if at_s is not None:
+        found = [entry for entry in found if was_captured(snapshot, entry, row, at_s)]
     counts: dict[CommitId, tuple[int, int]] = {}
     for contribution in found[-ENTRIES_MAX:]:
         body = snapshot.diff(contribution.commit, key)
         if body is not None:
-            with DECODING.of_cell(geometry, voxels_of(body)):
+            with DECODING.of_cell(row.geometry, voxels_of(body)):
                 hits, misses = _only(decode_stored(key, body).evidence, place).counts.sum(axis=0).tolist()
             sign = 1 if contribution.kind == b"+" else -1
             before = counts.get(contribution.commit, (0, 0))
@@ -127,7 +135,7 @@ def _commits(snapshot: Snapshot, key: CellKey, place: int, geometry: Geometry) -
     seqs = {contribution.commit: contribution.seq for contribution in found}
     told = sorted((seqs[commit], counted) for commit, counted in counts.items() if any(n > 0 for n in counted))
     commits = [_commit(_entry(snapshot, seq), *counted) for seq, counted in reversed(told)]
-    return commits, len(found) > ENTRIES_MAX
+    return commits, is_more
 
 
 def _entry(snapshot: Snapshot, seq: int) -> LogEntry:

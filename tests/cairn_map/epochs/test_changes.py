@@ -1,42 +1,13 @@
 """What changed: a door that went, a crate that came, and noise, which is no change."""
 
 import numpy as np
-import numpy.typing as npt
 from hypothesis import given
 from hypothesis import strategies as st
+from tests.fixtures.map.changing import CRATE, GEOMETRY, MODEL, WALL, Cells, Numbers, scans
 
-from cairn_map.epochs.cell_history import CellHistory, cell_history, merged
+from cairn_map.epochs.cell_history import merged
 from cairn_map.epochs.changes import MapChanges, likelihood_ratio, map_changes
 from cairn_map.epochs.epoch import Epoch
-from cairn_map.evidence.channels import TEMPERATURE
-from cairn_map.evidence.evidence import packed_evidence
-from cairn_map.evidence.grid import CellKey, Geometry, split_voxels
-from cairn_map.evidence.inverse_sensor_model import SensorModel
-
-GEOMETRY = Geometry(voxel_edge_um=50_000, depth=4, channels=(TEMPERATURE,))
-MODEL = SensorModel()
-WALL = np.array([[x, 0, z] for x in range(-12, 12) for z in range(12)])
-"""Voxels of a wall across two cells."""
-CRATE = np.array([[x, y, z] for x in range(4, 8) for y in range(6, 10) for z in range(4, 8)])
-
-Numbers = npt.NDArray[np.int64]
-Cells = dict[CellKey, CellHistory]
-
-
-def scans(voxels: Numbers, epoch: int, *, hits: int = 0, misses: int = 0, kelvin: float | None = None) -> Cells:
-    """Evidence of one epoch, alike in all these voxels."""
-    cells, places = split_voxels(voxels, GEOMETRY)
-    samples = np.zeros((len(voxels), 3), np.int64)
-    if kelvin is not None:
-        value = round(kelvin / 0.05)
-        samples[:] = [value * hits, value**2 * hits, hits]
-    counts = np.tile([hits, misses], (len(voxels), 1))
-    return {
-        CellKey(int(key)): cell_history(
-            {Epoch(epoch): packed_evidence(places[cells == key], counts[cells == key], samples[cells == key], GEOMETRY)}
-        )
-        for key in np.unique(cells)
-    }
 
 
 def together(*parts: Cells) -> Cells:

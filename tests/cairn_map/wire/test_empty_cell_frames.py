@@ -8,6 +8,7 @@ from tests.fixtures.map.made import SMALL
 
 from cairn_map.codec.cell_code import encode_empty_cell
 from cairn_map.commits.cursor import Cursor
+from cairn_map.epochs.layer import MapLayer
 from cairn_map.evidence.fingerprint import ZERO
 from cairn_map.evidence.grid import CellKey
 from cairn_map.wire import empty_cell_frames
@@ -26,7 +27,7 @@ def test_frames_made_at_once_have_the_bytes_of_each(
 ) -> None:
     """All bytes of each row, checksum included, are those of its frame encoded alone, and their sizes are counted."""
     many = EmptyCellFrames(
-        kind=kind, cells=np.array(keys, np.uint64), from_cursor=start, to_cursor=HEAD, geometry=SMALL
+        kind=kind, cells=np.array(keys, np.uint64), from_cursor=start, to_cursor=HEAD, layer=MapLayer(geometry=SMALL)
     )
     single = [
         CellFrame(
@@ -50,7 +51,11 @@ def test_frames_made_at_once_have_the_bytes_of_each(
 def test_many_frames_come_in_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
     """However many rows are made in one go, the bytes are the same."""
     many = EmptyCellFrames(
-        kind=FrameKind.RESET, cells=np.arange(10, dtype=np.uint64), from_cursor=None, to_cursor=HEAD, geometry=SMALL
+        kind=FrameKind.RESET,
+        cells=np.arange(10, dtype=np.uint64),
+        from_cursor=None,
+        to_cursor=HEAD,
+        layer=MapLayer(geometry=SMALL),
     )
     whole = b"".join(many.encoded())
     monkeypatch.setattr(empty_cell_frames, "ROWS_MAX", 3)
@@ -65,6 +70,6 @@ def test_a_few_frames_are_made_without_tables(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(empty_cell_frames, "_crc_changes", None)
     for kind in (FrameKind.FULL, FrameKind.RESET):
         one = EmptyCellFrames(
-            kind=kind, cells=np.array([5], np.uint64), from_cursor=None, to_cursor=HEAD, geometry=SMALL
+            kind=kind, cells=np.array([5], np.uint64), from_cursor=None, to_cursor=HEAD, layer=MapLayer(geometry=SMALL)
         )
         assert len(b"".join(one.encoded())) > one.size_bytes

@@ -12,7 +12,7 @@ from tests.naive.asker import NaiveAsker
 from cairn_map.evidence.grid import CellKey
 from cairn_map.wire.frames import CellFrame, FrameKind, frames_of
 from cairn_map.wire.messages import Done
-from cairn_server.folding.cells_at_rest import stored_evidence
+from cairn_server.folding.cells_at_rest import check_stored
 from cairn_server.store.sqlite.store import FILE_NAME
 from cairn_server.store.store_rows import MapRow
 
@@ -102,7 +102,7 @@ def assert_sound_at_rest(live: Live, row: MapRow) -> None:
     with live.service.store.snapshot(row) as snapshot:
         stored = snapshot.cell(BROKEN)
     assert stored
-    stored_evidence(stored)
+    check_stored(stored, row.layer)
 
 
 def test_missing_heals_too(live: Live) -> None:

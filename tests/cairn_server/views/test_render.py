@@ -98,8 +98,8 @@ def test_cells_that_were_drawn_are_not_read_again_and_weigh_what_their_layer_doe
     with live.service.store.snapshot(row) as snapshot:
         chains = {snapshot.chain_at(cell.lm) for cell in snapshot.cells()}
     kept = {name: read for name, (read, _) in views._read_cells._kept.items() if name[0][0] in chains}
-    assert {layer for _, layer in kept} == set(Layer) - {Layer.AGE}
-    for (_, layer), read in kept.items():
+    assert {layer for _, layer, _ in kept} == set(Layer) - {Layer.AGE}
+    for (_, layer, _), read in kept.items():
         arrays = (read.cell.counts.brick_of, read.states.bricks, read.states.words, *read.tables.tables.values())
         assert read.size_bytes == sum(array.nbytes for array in arrays)
         assert len(read.tables.tables) == (layer is not Layer.DEPTH)

@@ -5,7 +5,7 @@ together have fewer places than there are threads, so none waits in a thread for
 is whole, and ends with the first byte of its answer: slow links hold none. Work that may take long ends with its
 connection (`access.cancellation`). Plain ASGI.
 
-    missing 8, pictures 2, exports 2, files of cells 1, all others 24  <  40 threads (anyio's default)
+    missing 8, pictures 2, exports 2, changes 2, files of cells 1, all others 24  <  40 threads (anyio's default)
 """
 
 import asyncio
@@ -19,6 +19,7 @@ from cairn_server.access.cancellation import CANCELLATION, Cancellation, StopTim
 from cairn_server.access.turns import Turns
 from cairn_server.http.middleware.asgi import App, Message, Receive, Send, send_error
 from cairn_server.http.middleware.token_first import caller_key
+from cairn_server.views.map_changes import SEARCHES_AT_ONCE
 from cairn_server.views.map_exports import COUNTS_AT_ONCE
 from cairn_server.views.map_views import RENDERS_AT_ONCE
 
@@ -29,6 +30,7 @@ WAIT_S = 30.0
 PICTURE_WAIT_S = 5.0
 MISSING = re.compile(r"/maps/[^/]*/branches/[^/]*/missing")
 PICTURES = re.compile(r"/maps/[^/]*/main/render")
+CHANGES = re.compile(r"/maps/[^/]*/main/changes")
 CELL_FILES = re.compile(r"/maps/[^/]*/main/cells/[^/]*\.(npz|ply)")
 EXPORTS = re.compile(r"/maps/[^/]*/main/export(/tickets)?")
 
@@ -49,6 +51,7 @@ class Lanes:
         self._by_path = {
             MISSING: Lane(Turns(places=8, share=1, wait_s=WAIT_S)),
             PICTURES: Lane(Turns(places=RENDERS_AT_ONCE, share=1, wait_s=PICTURE_WAIT_S)),
+            CHANGES: Lane(Turns(places=SEARCHES_AT_ONCE, share=1, wait_s=PICTURE_WAIT_S)),
             CELL_FILES: Lane(Turns(places=1, share=1, wait_s=PICTURE_WAIT_S)),
             EXPORTS: Lane(Turns(places=COUNTS_AT_ONCE, share=1, wait_s=PICTURE_WAIT_S)),
         }

@@ -13,6 +13,7 @@ from cairn_server.access.auth import Caller, Role
 from cairn_server.http.routes.callers import (
     OWNERS,
     READERS,
+    Format,
     Map,
     Operations,
     OwnOrigins,
@@ -20,6 +21,7 @@ from cairn_server.http.routes.callers import (
     body_of,
     own_branch,
     registrar,
+    require_format,
 )
 from cairn_server.http.routes.documentation import answers, body, json_body, problems
 from cairn_server.http.routes.json_bodies import json_of
@@ -50,9 +52,11 @@ def register(
     caller: Annotated[Caller, Depends(registrar)],
     body: Annotated[Register, json_of(Register)],
     own: OwnOrigins,
+    known: Format,
     cairn_proof: Annotated[str | None, Header(max_length=PROOF_TEXT_MAX)] = None,
 ) -> Registered:
     """Register a robot; registering again replaces its token, and takes a proof that it is the same robot."""
+    require_format(row, known)
     author = Author(RobotName(body.robot), Incarnation(body.incarnation))
     with service.sync.admissions.registering(row, caller, author, cairn_proof, own=own) as grounds:
         registered = service.maps.register(row, body, grounds)

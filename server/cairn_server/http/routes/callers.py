@@ -13,8 +13,9 @@ from fastapi import Depends, Header, Request
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 from starlette.requests import HTTPConnection
 
+from cairn_map.commits.commit import EPOCH_VERSION, SUM_VERSION
 from cairn_map.commits.key_proof import PROOF_TEXT_MAX
-from cairn_map.errors import DeniedError, NotFoundError
+from cairn_map.errors import BadInputError, DeniedError, NotFoundError
 from cairn_server.access.auth import READING, Caller, Role, bad_token, caller_of, require, require_all_maps
 from cairn_server.access.own_names import OwnNames
 from cairn_server.service import Service
@@ -94,6 +95,28 @@ async def caller_on_map(row: Map, asker: Asking) -> Caller:
 OnMap = Annotated[Caller, Depends(caller_on_map)]
 
 
+async def format_of(cairn_format: Annotated[str | None, Header(max_length=8)] = None) -> int:
+    """Newest version of the map format that a client reads, which clients state from version 2 on."""
+    return int(cairn_format) if cairn_format is not None and cairn_format.isdecimal() else SUM_VERSION
+
+
+Format = Annotated[int, Depends(format_of)]
+
+
+def require_format(row: MapRow, known: int) -> None:
+    """Refuse a client that could not read the bytes of a map's cells.
+
+    Raises:
+        BadInputError: kind `unknown_version`.
+    """
+    if row.layer.has_epochs and known < EPOCH_VERSION:
+        raise BadInputError(
+            "unknown_version",
+            f"map {row.name} keeps evidence by epoch, in bytes of version {EPOCH_VERSION}, and this client reads "
+            f"version {known}; update it, or have it work on a map made with --epoch none",
+        )
+
+
 def allowed(*roles: Role) -> Callable[[Caller], Awaitable[Caller]]:
     """A dependency: the caller on a map, if it is an admin or has one of these roles."""
 
@@ -165,6 +188,8 @@ class Visit:
     service: Service
     row: MapRow
     caller: Caller
+    format: int
+    """`format_of` the client."""
 
 
 async def visiting_robot(name: str, request: Request) -> Visit:
@@ -184,7 +209,7 @@ async def visiting_owner(name: str, branch: str, request: Request) -> Visit:
 async def _visit(name: str, request: Request) -> Visit:
     asker = _asker(request, await bearer(request))
     row = asker.map(name)
-    return Visit(asker.service, row, asker.caller(row))
+    return Visit(asker.service, row, asker.caller(row), await format_of(request.headers.get("cairn-format")))
 
 
 async def body_of(request: Request) -> bytes:

@@ -5,9 +5,11 @@ from typing import Annotated
 
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
 
+from cairn_map.commits.commit import EPOCH_VERSION
 from cairn_map.commits.cursor import cursor_from_text
 from cairn_map.commits.ids import author_from_text
 from cairn_map.commits.version_vector import vector_digest, vector_text
+from cairn_map.epochs.moment import TimeText, time_from_text
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.grid import cell_from_text, cell_key
 from cairn_map.files.cell_files import CELL_MEDIA_TYPE, FORMS, MEDIA_TYPES
@@ -15,11 +17,11 @@ from cairn_map.wire.messages import INDEX_PAGE, INDEX_PAGE_MAX, CellIndex
 from cairn_map.wire.voxel_messages import VoxelAnswer
 from cairn_server.access.auth import Caller
 from cairn_server.folding.cell_index import IndexPage, box_from_text
-from cairn_server.http.routes.callers import READERS, Map, Operations, body_of, reader
+from cairn_server.http.routes.callers import READERS, Format, Map, Operations, body_of, reader
 from cairn_server.http.routes.documentation import answers, body, problems
 from cairn_server.http.routes.problems import answer_to
 from cairn_server.store.store_rows import Head, MapRow
-from cairn_server.views.cell_views import BUNDLE_MEDIA_TYPE, media_type_of
+from cairn_server.views.cell_views import BUNDLE_MEDIA_TYPE, TOTAL, CellForm
 from cairn_server.views.voxel_report import asked_voxel, voxel_at
 
 ONE_RANGE = re.compile(r"bytes=[ \t]*(\d{0,18})-(\d{0,18})[ \t]*", re.ASCII | re.IGNORECASE)
@@ -83,17 +85,20 @@ def vector(service: Operations, row: Map, at: Annotated[str, Query(max_length=12
 
 
 @router.get("/maps/{name}/main/voxels/{voxel}", dependencies=READERS)
-def voxel(voxel: str, service: Operations, row: Map) -> VoxelAnswer:
-    """One voxel of the lattice: its exact numbers, and the commits that saw it."""
-    return asked_voxel(service.store, service.cells, row, voxel)
+def voxel(voxel: str, service: Operations, row: Map, time: Annotated[TimeText | None, Query()] = None) -> VoxelAnswer:
+    """One voxel of the lattice: its exact numbers, and the commits that saw it; now, or as it was at a time."""
+    return asked_voxel(service.store, service.cells, row, voxel, at_s=_time_s(time))
 
 
 @router.get("/maps/{name}/main/voxels", dependencies=READERS)
 def voxel_of_point(
-    service: Operations, row: Map, at: Annotated[str, Query(description="x,y,z: metres, map frame")]
+    service: Operations,
+    row: Map,
+    at: Annotated[str, Query(description="x,y,z: metres, map frame")],
+    time: Annotated[TimeText | None, Query()] = None,
 ) -> VoxelAnswer:
     """The voxel in which a point lies: as the one by its numbers."""
-    return asked_voxel(service.store, service.cells, row, voxel_at(row.geometry, at))
+    return asked_voxel(service.store, service.cells, row, voxel_at(row.geometry, at), at_s=_time_s(time))
 
 
 @router.head(
@@ -113,32 +118,47 @@ def get_cell(
     request: Request,
     service: Operations,
     row: Map,
+    version: Format,
     depth: Annotated[
         int | None, Query(ge=1, le=64, description="octree depth of a view; only without suffix or .view")
     ] = None,
+    known: Annotated[
+        bool, Query(description="a view of free nodes, too, with log-odds; only with .view or depth")
+    ] = False,
+    at: Annotated[TimeText | None, Query()] = None,
     if_none_match: Annotated[str | None, Header()] = None,
     if_range: Annotated[str | None, Header()] = None,
     range_: Annotated[str | None, Header(alias="Range")] = None,
 ) -> Response:
-    """One cell: the octree, or by suffix `.npz`, `.ply`, `.view`; strong ETag, cursor and coverage in the headers."""
+    """One cell: the octree, or by suffix `.npz`, `.ply`, `.view`; strong ETag, cursor and coverage in the headers.
+
+    With `at` it is the cell as it was at that time, by capture. Of a map with epochs clients that do not state
+    `Cairn-Format: 2` get the sum of all epochs.
+    """
     number, dot, suffix = cell.partition(".")
     key = cell_key(cell_from_text(number))
-    _check_form(dot, suffix, depth, row)
-    found = service.views.cells.asked(row, key, suffix, depth, known=if_none_match)
+    _check_form(dot, suffix, depth, row, has_style=depth is not None or known)
+    # A client that cannot read rows by epoch gets their sum (rule T5).
+    is_total = not suffix and depth is None and row.layer.has_epochs and version < EPOCH_VERSION
+    form = CellForm(TOTAL if is_total else suffix, depth, _time_s(at), known)
+    found = service.views.cells.asked(row, key, form, known=if_none_match)
     headers = {
         "ETag": found.etag,
         "Cache-Control": "no-cache",
         "Accept-Ranges": "bytes",
         "Cairn-Cursor": str(found.head.cursor),
-        "Cairn-Fingerprint": found.stored.fingerprint.hex(),
         **_coverage(found.head),
     }
+    if row.layer.has_epochs:
+        headers["Vary"] = "Cairn-Format"
+    if found.fingerprint is not None:
+        headers["Cairn-Fingerprint"] = found.fingerprint.hex()
     if found.data is None:
         return Response(status_code=304, headers=headers)
     if suffix:
         headers["Content-Disposition"] = f'attachment; filename="{row.name}_{number}.{suffix}"'
     asked_range = range_ if request.method == "GET" else None
-    return _whole_or_part(found.data, media_type_of(suffix, depth), headers, asked_range, if_range)
+    return _whole_or_part(found.data, form.media_type, headers, asked_range, if_range)
 
 
 @router.put(
@@ -175,14 +195,16 @@ def _whole_or_part(
     return Response(data[start:stop], 206, media_type=media_type, headers=headers)
 
 
-def _check_form(dot: str, suffix: str, depth: int | None, row: MapRow) -> None:
+def _time_s(text: str | None) -> float | None:
+    return None if text is None else time_from_text(text)
+
+
+def _check_form(dot: str, suffix: str, depth: int | None, row: MapRow, *, has_style: bool) -> None:
     if dot and suffix not in MEDIA_TYPES:
         raise BadInputError("unknown_format", f"cells come as {FORMS}, not as .{suffix[:16]}")
-    if depth is None:
-        return
-    if suffix not in ("", "view"):
-        raise BadInputError("unknown_format", f"only a view has a depth, a .{suffix} has none")
-    if depth > row.geometry.depth:
+    if has_style and (suffix not in ("", "view") or (not suffix and depth is None)):
+        raise BadInputError("unknown_format", f"only a view has a depth or a style, .{suffix or 'octree'} has none")
+    if depth is not None and depth > row.geometry.depth:
         raise BadInputError("bad_style", f"a view's depth must be 1 to {row.geometry.depth}, got {depth}")
 
 

@@ -1,4 +1,4 @@
-"""Routes by which a map leaves the server: as a picture, or as a file of points or an octree."""
+"""Routes by which a map leaves the server: as a picture, as a file of points or an octree, or as what changed."""
 
 from functools import partial
 from typing import Annotated
@@ -7,9 +7,11 @@ from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi.responses import StreamingResponse
 from starlette.types import Receive, Scope, Send
 
+from cairn_map.epochs.moment import TimeText
 from cairn_map.errors import DeniedError
-from cairn_map.files.export_request import EXPORT_TYPES, ExportRequest, ExportTicket, TicketedExport
+from cairn_map.files.export_request import BOX_CHARS_MAX, EXPORT_TYPES, ExportRequest, ExportTicket, TicketedExport
 from cairn_map.render.render_request import RenderRequest
+from cairn_map.wire.change_messages import ChangesAnswer
 from cairn_server.access.connection_places import ConnectionPlace
 from cairn_server.http.middleware.deadlines import PLACE
 from cairn_server.http.routes.callers import READERS, Asking, Credentials, Map, Operations
@@ -62,6 +64,20 @@ def render(
         return Response(status_code=304, headers=headers)
     headers["X-Content-Type-Options"] = "nosniff"
     return Response(view.body, media_type=PICTURES[asked.format], headers=headers)
+
+
+@router.get("/maps/{name}/main/changes", dependencies=READERS, responses=problems(409, 413))
+def changes(
+    service: Operations,
+    row: Map,
+    since: TimeText,
+    until: TimeText | None = None,
+    box: Annotated[
+        str | None, Query(max_length=BOX_CHARS_MAX, description="x0,y0,z0,x1,y1,z1: metres, map frame")
+    ] = None,
+) -> ChangesAnswer:
+    """Voxels that appeared, went, moved by a voxel, or became warmer or colder after a time, by capture."""
+    return service.views.changes.asked(row, since, until, box)
 
 
 async def map_without_ticket(name: str, request: Request, asker: Asking) -> MapRow | None:

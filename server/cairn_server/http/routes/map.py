@@ -4,10 +4,11 @@ from typing import Annotated
 
 from fastapi import APIRouter, Depends, Query, Response
 
+from cairn_map.commits.commit import EPOCH_VERSION
 from cairn_map.wire.live_events import NAMES_MAX
 from cairn_map.wire.messages import CreateMap, LogEntry, MapInfo, Retract, Retracted
 from cairn_server.access.auth import READING, Caller, Role
-from cairn_server.http.routes.callers import READERS, Map, Operations, admin, allowed, reader_somewhere
+from cairn_server.http.routes.callers import READERS, Format, Map, Operations, admin, allowed, reader_somewhere
 from cairn_server.http.routes.documentation import also, json_body, problems
 from cairn_server.http.routes.json_bodies import json_of
 
@@ -17,9 +18,12 @@ router = APIRouter()
 
 
 @router.get("/maps")
-def list_maps(service: Operations, caller: Annotated[Caller, Depends(reader_somewhere)]) -> list[MapInfo]:
+def list_maps(
+    service: Operations, caller: Annotated[Caller, Depends(reader_somewhere)], known: Format
+) -> list[MapInfo]:
     """The maps that the token counts on."""
-    return [service.maps.info(row) for row in service.store.maps() if caller.counts_on(row.number)]
+    rows = [row for row in service.store.maps() if caller.counts_on(row.number)]
+    return [_known_facts(service.maps.info(row), known) for row in rows]
 
 
 @router.put(
@@ -37,19 +41,25 @@ def create_map(
     caller: Annotated[Caller, Depends(admin)],
     body: Annotated[CreateMap, json_of(CreateMap)],
     response: Response,
+    known: Format,
 ) -> MapInfo:
     """Create a map; 200 if an equal one exists."""
     info, is_new = service.maps.create(name, body)
     if is_new:
         service.store.audit_log.add(caller.name, "create_map", name)
     response.status_code = 201 if is_new else 200
-    return info
+    return _known_facts(info, known)
 
 
 @router.get("/maps/{name}", dependencies=[Depends(allowed(*READING, Role.ENROLLER))])
-def get_map(service: Operations, row: Map) -> MapInfo:
+def get_map(service: Operations, row: Map, known: Format) -> MapInfo:
     """One map's extent, sizes and head."""
-    return service.maps.info(row)
+    return _known_facts(service.maps.info(row), known)
+
+
+def _known_facts(info: MapInfo, known: int) -> MapInfo:
+    """Facts of a map without those that the client's version of the format does not have."""
+    return info if known >= EPOCH_VERSION else info.model_copy(update={"epoch_s": None, "history_bytes": 0})
 
 
 @router.post(

@@ -17,6 +17,7 @@ from cairn_server.http.routes.callers import (
     Visit,
     allowed,
     body_of,
+    require_format,
     visiting_owner,
     visiting_robot,
 )
@@ -94,6 +95,7 @@ def missing(
     asked: Annotated[Asked, json_of(MissingRequest, asked_of)],
 ) -> Response:
     """Frames that bring the caller to the head; 204 if they are those of the last reply."""
+    require_format(visit.row, visit.format)
     reply = visit.service.sync.replies.missing(visit.row, branch, asked)
     return Response(reply, media_type=REPLY_MEDIA_TYPE) if reply else Response(status_code=204)
 

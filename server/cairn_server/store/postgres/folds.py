@@ -113,7 +113,7 @@ def write_fold(connection: Connection, row: MapRow, fold: Fold, *, age_s: float)
     sums, corners = tiles.write()
     _move_head(connection, row, fold, sums, corners)
     if crosses_mark(fold.base, fold.head):
-        snapshot = PgSnapshot(connection, row.number, row.geometry.digest(), KnownVectors(), NoObjects())
+        snapshot = PgSnapshot(connection, row.number, row.layer.digest(), KnownVectors(), NoObjects())
         snapshot.keep_mark(fold.head.seq)
     return True
 

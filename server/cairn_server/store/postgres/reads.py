@@ -161,7 +161,7 @@ class PgReads:
     def snapshot(self, row: MapRow) -> Iterator[PgSnapshot]:
         """One state of the map."""
         with self._connections.snapshot() as connection:
-            yield PgSnapshot(connection, row.number, row.geometry.digest(), self._vectors, self._objects)
+            yield PgSnapshot(connection, row.number, row.layer.digest(), self._vectors, self._objects)
 
     def map_rows(self, clause: str, values: tuple[Any, ...]) -> list[MapRow]:
         """Maps that fit a clause of ours."""

@@ -54,14 +54,14 @@ class PgSnapshot:
         self,
         connection: Connection,
         map_number: int,
-        geometry_digest: bytes,
+        layer_digest: bytes,
         vectors: KnownVectors,
         objects: ColdReads,
     ) -> None:
         self._connection = connection
         self._objects = objects
         self._map = map_number
-        self._geometry_digest = geometry_digest
+        self._layer_digest = layer_digest
         self._vectors = vectors
         head = first(connection, "SELECT log_id, seq, chain FROM head WHERE map = %s", (map_number,))
         if head is None:
@@ -77,7 +77,7 @@ class PgSnapshot:
     def chain_at(self, seq: int) -> bytes | None:
         """The chain after entry `seq` (0: of the empty log); None if there is no such entry."""
         if seq == 0:
-            return first_chain(self._head.log_id, self._geometry_digest)
+            return first_chain(self._head.log_id, self._layer_digest)
         if seq == self._head.seq:
             return self._head.chain
         query = "SELECT chain FROM log WHERE map = %s AND seq = %s"

@@ -160,7 +160,7 @@ class PgStore(PgReads):
                 _bar_older_programs(connection)
             connection.execute(
                 "INSERT INTO head (map, log_id, seq, chain, fingerprint) VALUES (%s, %s, 0, %s, %s)",
-                (number, log_id, first_chain(log_id, geometry.digest()), ZERO.to_bytes()),
+                (number, log_id, first_chain(log_id, layer.digest()), ZERO.to_bytes()),
             )
             return True
 

@@ -109,7 +109,7 @@ def write_fold(connection: apsw.Connection, row: MapRow, fold: Fold, *, age_s: f
     )
     _write_cells(connection, row, fold)
     if crosses_mark(fold.base, fold.head):
-        snapshot = SqliteSnapshot(connection, row.number, row.geometry.digest(), KnownVectors())
+        snapshot = SqliteSnapshot(connection, row.number, row.layer.digest(), KnownVectors())
         mark_at(connection, row.number, fold.head.seq, snapshot.vector_at(fold.head.seq))
     return True
 

@@ -94,7 +94,7 @@ class SqliteReads:
     def snapshot(self, row: MapRow) -> Iterator[SqliteSnapshot]:
         """One state of the map."""
         with self._readers.transaction() as connection:
-            yield SqliteSnapshot(connection, row.number, row.geometry.digest(), self._vectors)
+            yield SqliteSnapshot(connection, row.number, row.layer.digest(), self._vectors)
 
     def map_rows(self, clause: str, values: Values) -> list[MapRow]:
         """Maps that fit a clause of ours."""

@@ -45,11 +45,11 @@ class SqliteSnapshot:
     """`store.Snapshot` over one connection that is inside a read transaction."""
 
     def __init__(
-        self, connection: apsw.Connection, map_number: int, geometry_digest: bytes, vectors: KnownVectors
+        self, connection: apsw.Connection, map_number: int, layer_digest: bytes, vectors: KnownVectors
     ) -> None:
         self._connection = connection
         self._map = map_number
-        self._geometry_digest = geometry_digest
+        self._layer_digest = layer_digest
         self._vectors = vectors
         self._head = Cursor(*first(connection, "SELECT log_id, seq, chain FROM map WHERE number = ?", (map_number,)))
 
@@ -61,7 +61,7 @@ class SqliteSnapshot:
     def chain_at(self, seq: int) -> bytes | None:
         """The chain after entry `seq` (0: of the empty log); None if there is no such entry."""
         if seq == 0:
-            return first_chain(self._head.log_id, self._geometry_digest)
+            return first_chain(self._head.log_id, self._layer_digest)
         chain: bytes | None = first(
             self._connection, "SELECT chain FROM log WHERE map = ? AND seq = ?", (self._map, seq)
         )

@@ -168,7 +168,7 @@ class SqliteStore(SqliteReads):
                     sensor_model.model_dump_json(),
                     new_incarnation(),
                     log_id,
-                    first_chain(log_id, geometry.digest()),
+                    first_chain(log_id, layer.digest()),
                     json.dumps(tops),
                     layer.epoch_s,
                 ),

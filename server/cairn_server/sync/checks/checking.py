@@ -45,7 +45,7 @@ def check_commit(reader: CommitReader) -> Checked:
         check_evidence(reader.meta, cell, tops[cell.key])
         digests.append(cell.digest)
         bricks += cell.content.octree.brick_count
-    return Checked(commit_sha(reader.text, digests), _by_region(tops), bricks)
+    return Checked(commit_sha(reader.text, digests, version=reader.meta.version), _by_region(tops), bricks)
 
 
 def new_commit(commit: Commit, tops: Mapping[int, tuple[int, ...]], *, bricks: int = 0) -> NewCommit:

@@ -33,16 +33,13 @@ def check_claims(row: MapRow, caller: Caller, id_text: str, meta: CommitMeta, *,
     """Refuse a commit by its meta alone, before its evidence is decoded.
 
     Raises:
-        BadInputError: kind `other_id`, `other_geometry`, `reserved_name` or `bad_commit`.
+        BadInputError: kind `other_id`, `other_geometry`, `other_layer`, `reserved_name` or `bad_commit`.
         DeniedError: kind `not_allowed`: made by, or retracting from, a robot that the caller is not.
         DamagedDataError: kind `empty_commit`.
     """
     if meta.id != id_text:
         raise BadInputError("other_id", f"the path names {id_text[:96]}, the commit calls itself {meta.id}")
-    if meta.geometry != row.geometry.digest().hex():
-        raise BadInputError(
-            "other_geometry", f"the commit was made for another grid than map {row.name} has ({row.geometry})"
-        )
+    _check_layer(row, meta)
     authors = {meta.commit_id.author.robot, *(target.author.robot for target in meta.retracted_ids)}
     foreign = sorted(author for author in authors if not caller.may_author(author))
     if foreign:
@@ -78,6 +75,21 @@ def check_epoch(epoch: Epoch, epoch_s: int, *, now_s: float) -> None:
         f"the commit's measurement is {wait_s + epoch_s:.0f} s in the future: the server's time is {now_s:.3f} ({now})",
         retry_after_s=math.ceil(min(wait_s, AGAIN_MAX_S)),
     )
+
+
+def _check_layer(row: MapRow, meta: CommitMeta) -> None:
+    """Refuse evidence of another grid, or by other epochs. Without epochs it is any map's of the grid: the base."""
+    if meta.grid != row.geometry.digest().hex():
+        raise BadInputError(
+            "other_geometry", f"the commit was made for another grid than map {row.name} has ({row.geometry})"
+        )
+    if meta.layers and meta.layers != row.layer.identities:
+        has = f"epochs of {row.epoch_s} s" if row.layer.has_epochs else "no epochs"
+        raise BadInputError(
+            "other_layer",
+            f"the commit was made for a map with epochs of {meta.layers[0].epoch_s} s in layer {meta.layers[0].name}, "
+            f"map {row.name} has {has} in layer {row.layer.name}",
+        )
 
 
 def check_evidence(meta: CommitMeta, cell: CanonicalCell, tops: npt.NDArray[np.int64]) -> None:
