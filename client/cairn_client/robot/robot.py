@@ -349,7 +349,6 @@ class Robot:
         open_s = self._measurement.captured_s if self._measurement else None
         if open_s is None or not self._clock.parts(open_s[1], scan.time_s, self._replica.layer.epoch_s):
             return None
-        log.info("an epoch of the map ended: the open measurement is committed")
         return self._commit("", (), None, NO_NOTES)
 
     def mount(self, rig: Rig) -> None:

@@ -1,10 +1,10 @@
 """List what changed in a map between two times of capture: appeared, gone, moved by a voxel, warmer, colder.
 
-    $ cairn map changes http://127.0.0.1:8750/maps/lab --since 14:05
-    since 2026-11-27 14:06:00 UTC, until now
-      appeared    412 voxels   0.026 m3   around 4.21, 1.02, 0.44   from 3.98, 0.81, 0.02 to 4.44, 1.24, 0.86
-      gone        960 voxels   0.061 m3   around 7.02, 2.50, 1.01   from 6.98, 2.06, 0.02 to 7.06, 2.94, 2.02
-      moved        31 voxels next to a surface that was or is there: mostly poses that are off by a voxel
+    $ cairn map changes http://127.0.0.1:8750/maps/lab --since 2025-10-09T09:35
+    since 2025-10-09 09:36:00 UTC, until now
+      appeared     794 voxels    0.099 m3   around 16.71, 8.65, -0.76   from 16.25, 8.25, -1.10 to 17.30, 9.15, -0.55
+      gone         598 voxels    0.075 m3   around 15.22, 1.82, 0.33   from 14.80, 1.75, -0.05 to 15.60, 1.90, 0.70
+      moved        341 voxels next to a surface that was or is there: mostly poses that are off by a voxel
 
 A voxel counts as changed by a statistical test, not because two readings differ: in a room where nothing moved, noise
 makes hundreds of voxels read otherwise. On a map with epochs a time stands for the end of its epoch. On a map without

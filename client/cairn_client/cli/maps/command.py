@@ -1,7 +1,7 @@
 """Create, look at, download and correct maps on a server.
 
     $ cairn map create http://127.0.0.1:8750/maps/lab --voxel 0.04
-    map lab: voxels of 4 cm, cells of 5.12 m, channels colour, intensity, temperature
+    map lab: voxels of 4 cm, cells of 5.12 m, channels colour, intensity, temperature, epochs of 120 s
     $ cairn map copy http://127.0.0.1:8750/maps/lab https://maps.example.org/maps/lab --follow
     $ cairn map ls http://127.0.0.1:8750
     $ cairn map info http://127.0.0.1:8750/maps/lab

@@ -39,8 +39,6 @@ FILE_KINDS = {
 }
 """Kinds of files that one may take for a map, by their suffix."""
 VOXEL_M = 0.04
-DEFAULT_EPOCH_S: int | None = None
-"""Length of an epoch in maps that are made here, seconds; `STANDARD_EPOCH_S` once servers fold evidence by epoch."""
 NO_EPOCHS = "none"
 EPOCH_HELP = (
     "seconds of capture whose evidence is one sum. Sums of different epochs are kept apart, and newer ones outweigh "
@@ -60,8 +58,7 @@ def add_parser(commands: Subparsers) -> None:
     create.add_argument(
         "--channels", help="colour,intensity,temperature, or those of --from; scalars as NAME:UNIT:STEP; '' for none"
     )
-    default = NO_EPOCHS if DEFAULT_EPOCH_S is None else DEFAULT_EPOCH_S
-    text = f"{EPOCH_HELP} ({default}, or that of --from)"
+    text = f"{EPOCH_HELP} ({STANDARD_EPOCH_S}, or that of --from)"
     create.add_argument("--epoch", metavar=f"SECONDS|{NO_EPOCHS}", help=text)
     create.add_argument("--from", dest="source", metavar="DIR|URL", help="folder of cells, or another map's URL")
 
@@ -235,7 +232,7 @@ def _geometry(args: argparse.Namespace) -> Geometry:
     return geometry_for(voxel_edge_m=VOXEL_M if args.voxel is None else args.voxel, channels=channels)
 
 
-def _epoch_s(text: str | None, *, otherwise: int | None = DEFAULT_EPOCH_S) -> int | None:
+def _epoch_s(text: str | None, *, otherwise: int | None = STANDARD_EPOCH_S) -> int | None:
     """Length of an epoch, seconds, or None for a map without.
 
     Raises:

@@ -22,6 +22,7 @@ from cairn_fusion.recording.view_agreement import pose_doubt
 from cairn_fusion.recording.way_doubts import way_doubts
 from cairn_map.codec.cell_code import Profile
 from cairn_map.commits.commit import Commit
+from cairn_map.epochs.epoch import STANDARD_EPOCH_S
 from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import BadInputError, DamagedDataError, NotFoundError, UnreachableError
 from cairn_map.evidence.channels import COLOUR, INTENSITY, TEMPERATURE, Channel
@@ -202,7 +203,7 @@ def _ensured(api: MapApi, name: str, args: argparse.Namespace, source: ScanSourc
                 "no_map", f"there is no map {name} yet; make one with `cairn map create`, or give --voxel METRES"
             ) from exc
         made = geometry_for(voxel_edge_m=args.voxel, channels=_channels(source))
-        return api.create_map(name, CreateMap(geometry=made)).layer
+        return api.create_map(name, CreateMap(geometry=made, epoch_s=STANDARD_EPOCH_S)).layer
     geometry = layer.geometry
     if wished is not None and wished.voxel_edge_um != geometry.voxel_edge_um:
         raise BadInputError(
