@@ -11,7 +11,7 @@ from pathlib import Path
 
 BOOT_ID_FILE = Path("/proc/sys/kernel/random/boot_id")
 BOOT_CLOCK = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
-"""Where there is no clock of Linux's kind, one that may stand still while the machine sleeps."""
+"""Number of the steady clock; off Linux it may be one that stands still while the machine sleeps."""
 
 
 def steady_now_s() -> float:

@@ -847,8 +847,8 @@ SWITCHES = (
         4,
         "a state frame has the changed blocks and no others",
         CELLS_CHANGED,
-        "changed = of_blocks(cache.evidence(snapshot, row), blocks)",
-        "changed = cache.evidence(snapshot, row)",
+        "changed = cache.evidence(snapshot, row, layer).of_blocks(blocks)",
+        "changed = cache.evidence(snapshot, row, layer)",
         "cairn_server/store/test_stamps.py::test_a_state_frame_names_the_changed_blocks_and_no_others",
     ),
     Switch(

@@ -368,7 +368,7 @@ class MapApi:
     def changes(
         self, name: str, *, since_s: float | None, until_s: float | None = None, box_m: Sequence[float] | None = None
     ) -> ChangesAnswer:
-        """What changed in a map between two times of capture; a box is x0, y0, z0, x1, y1, z1 in metres."""
+        """Changes of a map between two times of capture; a box is x0, y0, z0, x1, y1, z1 in metres."""
         asked = {"since": since_s, "until": until_s, "box": ",".join(map(str, box_m)) if box_m else None}
         params = {key: str(value) for key, value in asked.items() if value is not None}
         return message_from_json(ChangesAnswer, self._ask("GET", f"/maps/{name}/main/changes", params=params))

@@ -324,10 +324,7 @@ class Robot:
         return f"Robot({self.name} on map {self._map_name}, {self.mode}, {self.waiting} commits wait)"
 
     def observe(self, scan: Scan) -> Commit | None:
-        """Add a scan to the open measurement.
-
-        Returns:
-            None; on a map with epochs the commit of the scans before, if this one is of another epoch.
+        """Add a scan to the open measurement; the commit of the scans before, if this one begins another epoch.
 
         Raises:
             BadInputError: the scan does not fit the rig or the map; nothing was added.
@@ -345,7 +342,9 @@ class Robot:
             return commit
 
     def _end_epoch_before(self, scan: Scan) -> Commit | None:
-        """Commit the open measurement if its scans are of another epoch than this one: a commit is of one (rule T1)."""
+        """Commit the open measurement if its scans are of another epoch than this one."""
+        # Rule T1: a commit is of one epoch, that of its last scan. Scans of a minute ago must not outrank what others
+        # saw since, only because the measurement was closed late.
         open_s = self._measurement.captured_s if self._measurement else None
         if open_s is None or not self._clock.parts(open_s[1], scan.time_s, self._replica.layer.epoch_s):
             return None

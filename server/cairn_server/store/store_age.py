@@ -36,9 +36,9 @@ class Clocks:
 
     wall_s: Callable[[], float] = time.time
     steady_s: Callable[[], float] = time.monotonic
-    """Of ages: it stands still while the machine sleeps."""
+    """Steady clock of ages; it stands still while the machine sleeps."""
     sleepless_s: Callable[[], float] | None = None
-    """Of trust in the time of day: as steady, and counts on while the machine sleeps; None: that of ages does."""
+    """Steady clock of trust in the time of day, which counts on while the machine sleeps; None: that of ages does."""
     boot: str = ""
     """Boot of the machine with which the sleepless clock began; empty: unknown."""
 

@@ -37,7 +37,7 @@ Doubt = Literal["jumped", "behind"]
 
 
 @dataclass(frozen=True, slots=True)
-class Look:
+class ClockLook:
     """One look at both clocks."""
 
     wall_s: float
@@ -166,18 +166,18 @@ class ClockTrust:
             self._limit_s = float(row.epoch_s) if is_first else min(self._limit_s, row.epoch_s)
             self.note_push(row, newest)
 
-    def _look(self) -> Look:
+    def _look(self) -> ClockLook:
         before_s = self._clock.steady_s()
         wall_s = self._clock.wall_s()
         error_s = (self._clock.steady_s() - before_s) / 2
-        return Look(wall_s, before_s + error_s, error_s)
+        return ClockLook(wall_s, before_s + error_s, error_s)
 
     def _refresh(self) -> None:
         """Look, where that takes a microsecond; a database's clock goes on by the steady one between two looks."""
         if not self._is_shared:
             self._judge(self._look())
 
-    def _judge(self, found: Look) -> None:
+    def _judge(self, found: ClockLook) -> None:
         """Come to a doubt, or to none, by a look; under the lock."""
         self._last = found
         doubt = self._doubt_of(found)
@@ -195,7 +195,7 @@ class ClockTrust:
             )
             self._store.audit("clock_doubt", self._said(doubt))
 
-    def _doubt_of(self, found: Look) -> Doubt | None:
+    def _doubt_of(self, found: ClockLook) -> Doubt | None:
         if self._offset_s is not None and self._is_used:
             if abs(found.offset_s - self._offset_s) > self._limit_s + found.error_s:
                 return "jumped"
@@ -205,7 +205,7 @@ class ClockTrust:
         past_s = max(self._released_s, self._mark.trusted_s - self._limit_s, newest_s)
         return "behind" if found.wall_s < past_s - found.error_s else None
 
-    def _adopt(self, found: Look) -> None:
+    def _adopt(self, found: ClockLook) -> None:
         """Trust the clock as it is; under the lock."""
         if self._doubt is not None or self._mark.since_age_s is not None:
             self._end_doubt(found)
@@ -217,7 +217,7 @@ class ClockTrust:
         if found.steady_s - self._kept_s >= KEEP_EVERY_S:
             self._keep(replace(self._mark, trusted_s=found.wall_s))
 
-    def _end_doubt(self, found: Look, *, excused_s: float | None = None) -> None:
+    def _end_doubt(self, found: ClockLook, *, excused_s: float | None = None) -> None:
         """Trust the clock from here on, and let other servers of the store do so; under the lock."""
         self._last, self._doubt, self._offset_s = found, None, found.offset_s
         self._keep(

@@ -10,10 +10,9 @@ from tests.fixtures.client.made import GEOMETRY
 from tests.fixtures.server.epoch_contract import cell_of, fold_by_hand
 from tests.fixtures.server.pushes import KEYS
 
-from cairn_client.cli.maps import create
 from cairn_client.http.api import MapApi
 from cairn_client.main import main
-from cairn_map.epochs.epoch import EPOCH_S_MAX
+from cairn_map.epochs.epoch import EPOCH_S_MAX, STANDARD_EPOCH_S
 from cairn_map.wire.messages import CreateMap
 
 
@@ -28,7 +27,7 @@ def test_a_map_is_made_with_the_epochs_that_are_asked_for(live: LiveServer, caps
     for name, words, epoch_s in (
         ("lab", ["--epoch", "600"], 600),
         ("still", ["--epoch", "none"], None),
-        ("plain", [], create.DEFAULT_EPOCH_S),
+        ("plain", [], STANDARD_EPOCH_S),
     ):
         assert main(["map", "create", f"{live.url}/maps/{name}", "--voxel", "0.08", *words]) == 0
         assert ("epochs of 600 s" in capsys.readouterr().out) == (epoch_s == 600)

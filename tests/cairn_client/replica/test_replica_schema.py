@@ -114,5 +114,5 @@ def test_files_of_all_versions_have_the_form_that_is_checked(tmp_path: Path) -> 
         folder = changed(tmp_path / str(version), *drops, f"PRAGMA user_version = {version}")
         assert glance(folder).commits == ()
         open_and_read(folder)
-    with pytest.raises(BadInputError, match="has version 4"):
+    with pytest.raises(BadInputError, match=f"has version {VERSION + 1}"):
         open_and_read(changed(tmp_path / "new", f"PRAGMA user_version = {VERSION + 1}"))

@@ -54,7 +54,7 @@ def check_claims(row: MapRow, caller: Caller, id_text: str, meta: CommitMeta, *,
 
 
 def check_epoch(epoch: Epoch, epoch_s: int, *, now_s: float) -> None:
-    """Refuse a commit from the future, whoever brings it: it would outrank all others until its time has come.
+    """Refuse a commit from the future, by any caller: it would outrank all others until its time has come.
 
     The epoch after the present one is taken: clocks differ, and that costs no more than a delay.
 
