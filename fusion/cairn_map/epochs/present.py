@@ -92,13 +92,21 @@ def present(history: CellHistory, geometry: Geometry, model: SensorModel, *, at:
         The reading; voxels of rows after `at` are not in it.
     """
     read = history if at is None else history.until(at)
-    epochs, rows = np.array([*read.rows], np.int64), list(read.rows.values())
+    return present_of_rows(list(read.rows), list(read.rows.values()), geometry, model)
+
+
+def present_of_rows(
+    row_epochs: Sequence[Epoch], rows: Sequence[Evidence], geometry: Geometry, model: SensorModel
+) -> Present:
+    """`present` of rows, rising in epoch, that may be decoded whenever they are read: of each no array is kept."""
+    epochs = np.array(row_epochs, np.int64)
     # R1: counts, oldest row first.
     voxels = voxels_of_rows(rows, geometry)
     read_counts = counts_of_rows(voxels, rows, model)
     # R4: samples, newest row first.
     shown = ShownSamples(len(voxels), geometry)
-    for number, row in reversed(list(enumerate(rows))):
+    for number in reversed(range(len(rows))):
+        row = rows[number]
         shown.join(voxels, row.voxels[row.sampled], row.samples, number, read_counts.free_after)
     sampled = np.nonzero((shown.samples != 0).any(axis=1))[0]
     return Present(

@@ -6,16 +6,27 @@
 What was taken out of a map is in no reading, whenever it was taken out.
 """
 
-from cairn_map.codec.layer_code import encode_layer_cell
+from collections.abc import Sequence
+from typing import overload
+
+from cairn_map.codec.layer_code import encode_layer_cell, row_bodies
 from cairn_map.commits.cursor import ENTRY_FOLD
 from cairn_map.commits.ids import CommitId
 from cairn_map.epochs.cell_history import CellHistory, cell_history
 from cairn_map.epochs.epoch import BASE, Epoch, epoch_of
-from cairn_map.epochs.present import shown_evidence
+from cairn_map.epochs.present import present_of_rows, shown_evidence
 from cairn_map.errors import BadInputError, ConflictError
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey, cell_of_key
-from cairn_server.folding.cells_at_rest import decode_rows, stored_history, stored_surfaces, sum_of_contributions
+from cairn_server.cell_room import DECODING, decoded_bytes, voxels_of
+from cairn_server.folding.cells_at_rest import (
+    check_stored,
+    decode_rows,
+    decode_stored,
+    stored_history,
+    stored_surfaces,
+    sum_of_contributions,
+)
 from cairn_server.store.store import Snapshot, Store
 from cairn_server.store.store_rows import CellRow, Contribution, MapRow
 
@@ -31,7 +42,10 @@ def stored_reading(stored: CellRow, row: MapRow) -> Evidence:
     Raises:
         DamagedDataError: kind `damaged_store`: its bytes are not sound, or do not have its digest.
     """
-    return shown_evidence(stored_history(stored, row.layer), row.layer, row.sensor_model)
+    if fits(row, stored.voxels):
+        return shown_evidence(stored_history(stored, row.layer), row.layer, row.sensor_model)
+    check_stored(stored, row.layer)
+    return _reading_by_row(stored.key, stored.body, row, None)
 
 
 def stored_surface_reading(stored: CellRow, row: MapRow) -> Evidence:
@@ -49,7 +63,45 @@ def reading_of_body(key: CellKey, body: bytes, row: MapRow) -> Evidence:
     Raises:
         DamagedDataError: kind `damaged_store`: they are not sound.
     """
-    return shown_evidence(decode_rows(key, body, row.layer).history, row.layer, row.sensor_model)
+    if fits(row, voxels_of(body)):
+        return shown_evidence(decode_rows(key, body, row.layer).history, row.layer, row.sensor_model)
+    return _reading_by_row(key, body, row, None)
+
+
+def fits(row: MapRow, voxels: int) -> bool:
+    """True if all rows of a cell may be in memory at once; those of a map without epochs are one."""
+    return not row.layer.has_epochs or decoded_bytes(row.geometry, voxels) <= DECODING.limit_bytes
+
+
+class _RowsAtRest(Sequence[Evidence]):
+    """Rows of a cell, each decoded whenever it is read."""
+
+    def __init__(self, key: CellKey, bodies: Sequence[bytes]) -> None:
+        self._key = key
+        self._bodies = bodies
+
+    def __len__(self) -> int:
+        return len(self._bodies)
+
+    @overload
+    def __getitem__(self, number: int) -> Evidence: ...
+
+    @overload
+    def __getitem__(self, number: slice) -> Sequence[Evidence]: ...
+
+    def __getitem__(self, number: int | slice) -> Evidence | Sequence[Evidence]:
+        if isinstance(number, slice):
+            return _RowsAtRest(self._key, self._bodies[number])
+        return decode_stored(self._key, self._bodies[number]).evidence
+
+
+def _reading_by_row(key: CellKey, body: bytes, row: MapRow, until: Epoch | None) -> Evidence:
+    """Reading of a sound cell with more rows than fit in memory at once, one of them at a time; some times slower."""
+    bodies = {
+        epoch: each for epoch, each in row_bodies(body, key, row.layer).items() if until is None or epoch <= until
+    }
+    rows = _RowsAtRest(key, list(bodies.values()))
+    return present_of_rows(list(bodies), rows, row.geometry, row.sensor_model).evidence
 
 
 def past_reading(snapshot: Snapshot, stored: CellRow, row: MapRow, until_s: float) -> Evidence:
@@ -58,6 +110,9 @@ def past_reading(snapshot: Snapshot, stored: CellRow, row: MapRow, until_s: floa
     Raises:
         ConflictError, BadInputError, DamagedDataError: as `past_rows`.
     """
+    if row.epoch_s is not None and not fits(row, stored.voxels):
+        check_stored(stored, row.layer)
+        return _reading_by_row(stored.key, stored.body, row, epoch_of(until_s, row.epoch_s))
     return shown_evidence(past_rows(snapshot, stored, row, until_s), row.layer, row.sensor_model)
 
 

@@ -80,7 +80,7 @@ def test_a_sound_store_is_said_to_be_sound(check: Check, folder: Path) -> None:
         (
             "UPDATE cell SET (digest, fingerprint, body) = (SELECT digest, fingerprint, body FROM cell AS c"
             " WHERE c.number = 2) WHERE number = 1",
-            "at rest is cell",
+            "at rest: expected cell",
         ),
     ],
 )

@@ -211,3 +211,19 @@ def test_a_view_of_all_known_voxels_has_the_states_of_the_reading(live: Live) ->
         assert np.array_equal(shown.occupied(MODEL), read.occupied(MODEL))
         assert answer.headers["ETag"] != get(live, row, f"{path}.view").headers["ETag"]
         assert kind_of(get(live, row, f"{path}.npz", known="true")) == "unknown_format"
+
+
+def test_a_cell_with_more_rows_than_fit_in_memory_is_read_row_by_row_to_the_same_reading(
+    live: Live, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    row = map_of(live, DOOR)
+    with live.service.store.snapshot(row) as snapshot:
+        cells = [cell for key in live.cells(row) if (cell := snapshot.cell(CellKey(key)))]
+        found = []
+        for fits in (True, False):
+            monkeypatch.setattr(readings, "fits", lambda *_, fits=fits: fits)
+            now = [readings.stored_reading(cell, row) for cell in cells]
+            then = [readings.past_reading(snapshot, cell, row, 499) for cell in cells]
+            again = [readings.reading_of_body(cell.key, cell.body, row) for cell in cells]
+            found.append([now, then, again])
+    assert found[0] == found[1]
