@@ -24,6 +24,7 @@ from pathlib import Path
 from tests.bench.calibration import calibration_rows
 from tests.bench.coding import coding_rows
 from tests.bench.console import console_rows
+from tests.bench.epochs import epoch_rows
 from tests.bench.imports import import_rows
 from tests.bench.integration import integration_rows
 from tests.bench.large_map import large_map_rows
@@ -256,6 +257,7 @@ PARTS: dict[str, Callable[[bool], Iterator[Row]]] = {
     "calibration": calibration_rows,
     "coding": coding_rows,
     "console": console_rows,
+    "epochs": epoch_rows,
     "imports": import_rows,
     "integration": integration_rows,
     "links": link_rows,

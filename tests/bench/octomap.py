@@ -16,6 +16,7 @@ from cairn_fusion.transfer.transfer import points_from_range
 
 DRIVER = "octomap_driver"
 QUERIES = "octomap_queries"
+PROBES = "octomap_probes"
 """Names of the programs, and of their sources in this folder."""
 HEADER = Path("/usr/include/octomap/octomap.h")
 RANGE_MAX_M = 10.0
@@ -87,6 +88,16 @@ def voxel_states(driver: Path, scans: Path, out: Path, *, voxel_edge_m: float) -
     """(N, 4) numbers of the voxels that an `OcTree` of the scans knows, and 1 for occupied or -1 for free."""
     _run([str(driver), str(scans), str(voxel_edge_m), str(RANGE_MAX_M), str(out)])
     return np.fromfile(out, "<i4").reshape(-1, 4)
+
+
+def states_after_each(
+    driver: Path, scans: Path, folder: Path, places_m: npt.NDArray[np.float64], *, voxel_edge_m: float
+) -> npt.NDArray[np.int8]:
+    """(scans, N) 1 occupied, 0 unknown, -1 free: what an `OcTree` says of (N, 3) places after each of the scans."""
+    (folder / "probes").write_bytes(places_m.astype("<f4").tobytes())
+    files = [str(folder / name) for name in ("probes", "probed")]
+    subprocess.run([str(driver), str(scans), str(voxel_edge_m), str(RANGE_MAX_M), *files], check=True)
+    return np.fromfile(folder / "probed", np.int8).reshape(-1, len(places_m))
 
 
 def colour_tree(driver: Path, scans: Path, colours: Path, out: Path, *, voxel_edge_m: float) -> OctomapRun:

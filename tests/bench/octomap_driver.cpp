@@ -4,7 +4,7 @@
 //     octomap_driver SCANS RESOLUTION_M RANGE_MAX_M STATES          and the state of each known voxel, written to STATES
 //     octomap_driver SCANS RESOLUTION_M RANGE_MAX_M COLOURS OUT     a ColorOcTree, written to OUT (.ot)
 //
-// SCANS: for each scan float32 origin[3], int32 n, float32 xyz[n][3]; COLOURS: float32 xyz[3], uint8 rgba[4] each;
+// SCANS: octomap_scans.hpp; COLOURS: float32 xyz[3], uint8 rgba[4] each;
 // STATES: int32 xyz[3] of the voxel, counted from the origin, int32 1 for occupied and -1 for free.
 // Prints the CPU seconds that inserting took, and the number of leaves.
 #include <octomap/ColorOcTree.h>
@@ -14,41 +14,15 @@
 #include <ctime>
 #include <fstream>
 #include <iostream>
-#include <stdexcept>
 #include <string>
 #include <vector>
 
-struct Scan {
-    octomap::point3d origin;
-    octomap::Pointcloud points;
-};
+#include "octomap_scans.hpp"
 
 struct Colour {
     float xyz[3];
     std::uint8_t rgba[4];
 };
-
-template <typename T>
-bool read_into(std::ifstream& file, T* values, std::size_t count) {
-    return static_cast<bool>(file.read(reinterpret_cast<char*>(values), static_cast<std::streamsize>(count * sizeof(T))));
-}
-
-std::vector<Scan> read_scans(const std::string& path) {
-    std::ifstream file(path, std::ios::binary);
-    std::vector<Scan> scans;
-    float origin[3];
-    while (read_into(file, origin, 3)) {
-        std::int32_t count = 0;
-        if (!read_into(file, &count, 1)) throw std::runtime_error("a scan is cut off");
-        std::vector<float> xyz(3 * static_cast<std::size_t>(count));
-        if (!read_into(file, xyz.data(), xyz.size())) throw std::runtime_error("a scan is cut off");
-        Scan scan{{origin[0], origin[1], origin[2]}, {}};
-        scan.points.reserve(static_cast<std::size_t>(count));
-        for (std::size_t n = 0; n < xyz.size(); n += 3) scan.points.push_back(xyz[n], xyz[n + 1], xyz[n + 2]);
-        scans.push_back(scan);
-    }
-    return scans;
-}
 
 // The voxels of a scan once each (`discretize`), inner nodes brought up to date after all scans: the fastest way it has.
 template <typename Tree>

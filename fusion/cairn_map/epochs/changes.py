@@ -3,13 +3,14 @@
 A voxel has appeared or gone if all of this holds:
 
     its readings before and after differ                     occupied or not
-    G > 10.83                                                 likelihood ratio of hits among observations, p = 0.001
-    it has at least 4 new observations
+    G > 10.83                                                 likelihood ratio of hits among observations, p = 0.001,
+    with at least 4 new observations                          at some epoch since then, before and after it
     at least 4 of the 27 voxels around it changed the same way
 
 In a scene where nothing moved, readings alone differ in hundreds of voxels at each comparison, because poses and ranges
-are noisy. A voxel next to one that was occupied (appeared) or is occupied now (gone) may be a surface seen from a pose
-that is off by a voxel, and is reported apart. Temperatures change where the readings of both times have samples enough.
+are noisy. Voxels next to one that was occupied (appeared) or is occupied now (gone) may be a surface seen from a pose
+that is off by a voxel, and are reported apart, unless they touch a change that is farther from it: a crate's lowest
+voxels lie next to the floor. Temperatures change where the readings of both times have samples enough.
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,6 +35,8 @@ NEW_MIN = 4
 """Least count of new observations of a voxel."""
 TOGETHER_MIN = 4
 """Least count of voxels, of the 27 around one and itself, that changed the same way."""
+REACH = 2
+"""Voxels from one to the farthest that says what became of it: a neighbour's neighbour makes of it a rim or none."""
 WARMER_K = 5.0
 """Least change of a temperature, kelvin: makers of uncooled cameras state an accuracy of 5 K."""
 EXTENT_MAX = 1 << 62
@@ -115,7 +118,7 @@ def joined_changes(parts: Sequence[CellChanges]) -> MapChanges:
     # What stands together; and of it, what stands at a surface of the other time.
     appeared = lattice.together([part.appeared for part in parts])
     gone = lattice.together([part.gone for part in parts])
-    is_moved = (lattice.is_next_to(appeared, was), lattice.is_next_to(gone, now))
+    is_moved = (lattice.is_rim(appeared, was), lattice.is_rim(gone, now))
     return MapChanges(
         appeared=lattice.voxels(appeared[~is_moved[0]]),
         gone=lattice.voxels(gone[~is_moved[1]]),
@@ -154,14 +157,13 @@ def cell_changes(
     before, now = present(history, geometry, model, at=since), present(history, geometry, model)
     # The voxels of `now` are all; where each was before.
     rows = np.searchsorted(now.voxels, before.voxels)
-    counts = np.zeros_like(now.counts)
-    counts[rows] = before.counts
     was = np.zeros(len(now), np.bool_)
     was[rows] = before.occupied(model)
     occupied = now.occupied(model)
     # R3 a to c.
-    new = now.counts - counts
-    is_sure = (likelihood_ratio(counts, new) > G_MIN) & (new.sum(axis=1) >= NEW_MIN)
+    flipped = np.nonzero(occupied != was)[0]
+    is_sure = np.zeros(len(now), np.bool_)
+    is_sure[flipped] = _is_likely(history, now.voxels[flipped], now.counts[flipped], since)
     warmth = _warming(before, now, rows, geometry)
 
     def numbers(mask: npt.NDArray[np.bool_]) -> Ints:
@@ -175,6 +177,32 @@ def cell_changes(
         was_occupied=numbers(was),
         is_occupied=numbers(occupied),
     )
+
+
+def _is_likely(
+    history: CellHistory, voxels: npt.NDArray[np.uint32], counts: Ints, since: Epoch
+) -> npt.NDArray[np.bool_]:
+    """(N,) True where the observations after some epoch, not before `since`, differ from all until then.
+
+    What changed long after `since` was first seen as before: against these observations, too, the new ones count.
+
+    Args:
+        history: the cell's.
+        voxels: (N,) rising.
+        counts: (N, 2) their hits and misses of all times.
+        since: first epoch after which they may have changed.
+    """
+    found, old = np.zeros(len(voxels), np.bool_), np.zeros_like(counts)
+    epochs = list(history)
+    for epoch, following in zip(epochs, [*epochs[1:], None], strict=True):
+        row = history.rows[epoch]
+        at = np.minimum(np.searchsorted(row.voxels, voxels), len(row) - 1)
+        old += np.where((row.voxels[at] == voxels)[:, None], row.counts[at], 0)
+        # After this row lies a time at which they may have changed.
+        if following is not None and following > since:
+            new = counts - old
+            found |= (likelihood_ratio(old, new) > G_MIN) & (new.sum(axis=1) >= NEW_MIN)
+    return found
 
 
 def _warming(before: Present, now: Present, rows: npt.NDArray[np.intp], geometry: Geometry) -> Floats:
@@ -226,6 +254,11 @@ class _Lattice:
         for step in self._around:
             count += _isin(numbers + step, numbers)
         return numbers[count >= TOGETHER_MIN]
+
+    def is_rim(self, changed: Ints, surface: Ints) -> npt.NDArray[np.bool_]:
+        """(N,) True where a change is next to a surface of the other time, and to no change that is farther from it."""
+        is_near = self.is_next_to(changed, surface)
+        return is_near & ~self.is_next_to(changed, changed[~is_near])
 
     def is_next_to(self, numbers: Ints, others: Ints) -> npt.NDArray[np.bool_]:
         """(N,) True where one of the 26 voxels around a number is one of the others."""

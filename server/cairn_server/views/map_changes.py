@@ -17,7 +17,7 @@ import numpy as np
 
 from cairn_map.arrays import Floats, Ints
 from cairn_map.codec.layer_code import row_bodies
-from cairn_map.epochs.changes import CellChanges, cell_changes, joined_changes, voxels_within
+from cairn_map.epochs.changes import REACH, CellChanges, cell_changes, joined_changes, voxels_within
 from cairn_map.epochs.epoch import BASE, Epoch, begin_s, epoch_of
 from cairn_map.epochs.moment import time_from_text
 from cairn_map.errors import BadInputError, UnreachableError
@@ -146,7 +146,7 @@ class _Search:
         cell, side = np.array(cell_of_key(key)), self.row.geometry.side
         low, high = cell * side, (cell + 1) * side - 1
         near = (self._part(key) for key in self._keys_around(cell))
-        parts = [part.within(low - 1, high + 1) for part in near if part is not None]
+        parts = [part.within(low - REACH, high + REACH) for part in near if part is not None]
         changes = joined_changes([own, *parts])
         for way in WAYS:
             self._add(way, key, voxels_within(getattr(changes, way), low, high))

@@ -64,6 +64,20 @@ def test_a_wall_that_is_a_voxel_off_has_moved() -> None:
     assert not len(found.appeared) and not len(found.gone)
 
 
+def test_what_changed_long_after_was_first_seen_as_before() -> None:
+    as_ever = [scans(CRATE, epoch, hits=8) for epoch in (1, 6, 7, 8)]
+    found = changes(*as_ever, scans(CRATE, 9, misses=12))
+    assert as_set(found.gone) == as_set(CRATE)
+
+
+def test_a_crate_on_the_floor_has_appeared_down_to_the_floor() -> None:
+    floor = np.array([[x, y, 3] for x in range(12) for y in range(4, 12)])
+    ground = [scans(floor, epoch, hits=12) for epoch in (1, 9)]
+    found = changes(*ground, scans(CRATE, 1, misses=30), scans(CRATE, 9, hits=12))
+    assert as_set(found.appeared) == as_set(CRATE)
+    assert not len(found.moved)
+
+
 def test_changes_end_at_until() -> None:
     cells = together(scans(CRATE, 1, misses=30), scans(CRATE, 9, hits=12), scans(CRATE, 20, misses=60))
     come = map_changes(cells, GEOMETRY, MODEL, since=Epoch(5), until=Epoch(10))
