@@ -17,8 +17,8 @@ import numpy.typing as npt
 
 from cairn_calib.board.board import Board, Polarity
 from cairn_calib.board.corner_gates import FittedGrid, checker_signs
-from cairn_calib.board.corners import FOUND, Attempt, Corners, Detection
-from cairn_calib.board.grid_fit import fit_board
+from cairn_calib.board.corners import BY_HAND, FOUND, Attempt, Corners, Detection, pointed_attempt
+from cairn_calib.board.grid_fit import NO_FIT, fit_board, fit_pointed_board
 from cairn_calib.board.homography import fit_homography, map_points
 from cairn_calib.board.saddle_grid import NoGrid, saddle_grid
 from cairn_calib.board.saddle_points import saddle_points
@@ -196,6 +196,8 @@ def _eight_bits(even: Image) -> npt.NDArray[np.uint8]:
 def fit_pointed_at(image: npt.NDArray[np.generic], board: Board, pointed: Floats) -> Detection:
     """The corners of a chessboard that a person pointed at, in the person's order.
 
+    Every corner with edges at its place counts. What the gates would have refused is said with the attempt.
+
     Args:
         image: (H, W) counts.
         board: any chessboard.
@@ -209,9 +211,9 @@ def fit_pointed_at(image: npt.NDArray[np.generic], board: Board, pointed: Floats
     places = lattice[outer] if len(pointed) == 4 else lattice
     homography = fit_homography(places, pointed)
     if homography is None:
-        return Detection(None, (Attempt("by hand", 1.0, "candidates", "the corners pointed at lie on a line"),))
+        return Detection(None, (Attempt(BY_HAND, 1.0, "candidates", "the corners pointed at lie on a line"),))
     grid = map_points(homography, lattice) if len(pointed) == 4 else pointed
-    found = fit_board(grid, counts, board, order=lambda grid_found: grid_found)
-    if isinstance(found, Corners):
-        return Detection(found, (Attempt("by hand", 1.0, FOUND, f"{found.seen.sum()} corners"),))
-    return Detection(None, (Attempt("by hand", 1.0, *found),))
+    corners, odd = fit_pointed_board(grid, counts, board)
+    if corners is not None:
+        return Detection(corners, (pointed_attempt(f"{corners.seen.sum()} corners", odd),))
+    return Detection(None, (Attempt(BY_HAND, 1.0, *(odd or NO_FIT)),))

@@ -9,6 +9,10 @@ from cairn_calib.board.board import Board
 from cairn_map.arrays import Floats
 
 FOUND = "found"
+BY_HAND = "by hand"
+"""Method of points that a person pointed at."""
+NOT_REFUSED = "not refused, since it is pointed at"
+"""What is said of points by hand that a gate would have refused, before its reason."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,6 +27,11 @@ class Attempt:
 
     def __str__(self) -> str:
         return f"{self.method} x{self.scale:g}: {self.stage}{': ' if self.reason else ''}{self.reason}"
+
+
+def pointed_attempt(found: str, odd: tuple[str, str] | None) -> Attempt:
+    """Attempt on a board that a person pointed at: what was found, and the gate that would have refused it, and why."""
+    return Attempt(BY_HAND, 1.0, FOUND, found if odd is None else f"{found}; {NOT_REFUSED}: {odd[1]}")
 
 
 @dataclass(frozen=True, slots=True)

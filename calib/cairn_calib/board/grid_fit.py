@@ -30,6 +30,11 @@ SHARP_PX = 2.5
 """Blur of edges, pixels, up to which a corner's window of 17 x 17 pixels holds them; softer ones are fitted at a
 coarser scale."""
 NO_FIT = "refinement", "the edges that cross at the proposed corners cannot be fitted"
+MIRRORED = (
+    "orientation",
+    "the corners pointed at are those of a mirrored board: name the first, the end of its row, the end of the last row "
+    "and its start",
+)
 
 
 def fit_board(
@@ -43,14 +48,37 @@ def fit_board(
         board: the chessboard.
         order: puts the board's first corner first.
     """
-    # The scale: a power of 2, so that pixels are means of whole pixels.
-    factor = 1 << max(0, int(np.floor(np.log2(max(_step_px(grid, board) / CELL_PX, 1.0)))))
-    # Pixel centres are at whole numbers, so an image's edge is at -0.5 at every scale.
-    found = fit_grid((grid + 0.5) / factor - 0.5, reduce_image(counts, factor), board)
+    factor = _factor(grid, board)
+    found = _fit_reduced(grid, counts, board, factor)
     if found is None:
         return NO_FIT
     found = order(found)
     return refusal(found) or _sharpen(found, counts, factor)
+
+
+def fit_pointed_board(grid: Floats, counts: Image, board: Board) -> tuple[Corners | None, tuple[str, str] | None]:
+    """Corners at places that a person pointed at, with the gate that would have refused them, and why.
+
+    None, with the stage and the reason, where no corners are, or where they are those of a mirrored board. Arguments
+    are those of `fit_board`.
+    """
+    factor = _factor(grid, board)
+    found = _fit_reduced(grid, counts, board, factor)
+    if found is None:
+        return None, NO_FIT
+    if np.linalg.det(found.steps[found.kept]).max() < 0:
+        return None, MIRRORED
+    return _sharpen(found, counts, factor), refusal(found)
+
+
+def _factor(grid: Floats, board: Board) -> int:
+    """Scale of the gates: a power of 2, so that pixels are means of whole pixels."""
+    return 1 << max(0, int(np.floor(np.log2(max(_step_px(grid, board) / CELL_PX, 1.0)))))
+
+
+def _fit_reduced(grid: Floats, counts: Image, board: Board, factor: int) -> FittedGrid | None:
+    # Pixel centres are at whole numbers, so an image's edge is at -0.5 at every scale.
+    return fit_grid((grid + 0.5) / factor - 0.5, reduce_image(counts, factor), board)
 
 
 def _step_px(grid: Floats, board: Board) -> float:

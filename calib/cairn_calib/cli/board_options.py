@@ -76,8 +76,8 @@ def _refuse_turns(board: Board, args: argparse.Namespace) -> None:
         raise BadInputError(
             "board_turns",
             f"a board of {args.board} {args.pattern} looks the same after half a turn, so that no image shows which of "
-            "its points is the first: add --upright if its rows always run along the images' rows, left to right (for "
-            f"a rig of one camera any point may be the first: add it, too), or use another board: {better}",
+            "its points is the first: add --upright if its rows always run from left to right in the images (for a "
+            f"rig of one camera any point may be the first: add it, too), or use another board: {better}",
         )
 
 

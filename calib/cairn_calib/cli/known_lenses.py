@@ -4,7 +4,9 @@
     --hold left.k3=0                one number
     --prior left=rig.json           with the covariance that the file states
     --prior left=factory.yaml+-0.5  whose pixels are off by 0.5 px (root mean square over the image, one axis)
-    --prior left.fx=1330+-5         one number and its standard deviation; tx, ty, tz: the camera's place, metres
+    --prior left.fx=1330+-5         one number and its standard deviation
+    --prior left.tx=0.1+-0.001      of the camera's place: tx, ty, tz in metres, and rx, ry, rz in radians, the rotation
+                                    vector of T_rig_camera: ry=0.26 looks 15 degrees to the right
 
 A file is rig.json or any that `cairn calib convert` reads. It may have the camera under another name: `FILE#cam0`.
 """
@@ -19,6 +21,7 @@ import numpy as np
 
 from cairn_calib.diagnosis.probe_points import image_grid
 from cairn_calib.exchange.rig_exchange import RIG, format_of_text, read_cameras, read_text
+from cairn_calib.rig.calibration import POSE_UNITS
 from cairn_calib.rig.fisheye import FisheyeCamera
 from cairn_calib.rig.lens import Lens
 from cairn_calib.rig.rig import Rig, rig_from_json
@@ -26,7 +29,7 @@ from cairn_calib.solve.solve_plan import BROWN, FISHEYE, FOCAL_AND_CENTRE, Camer
 from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
 
-PLACE = ("tx", "ty", "tz")
+PLACE = tuple(POSE_UNITS)
 NUMBER = r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
 GRID = (32, 24)
 """Columns and rows of the pixels that a file's lens is held to."""

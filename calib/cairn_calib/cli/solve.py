@@ -36,10 +36,11 @@ differ enough; else a warning says so.
 
 What is known before counts with --prior: last year's rig.json, with the covariance that it states; a file of Kalibr,
 OpenCV, ROS or mrcal whose pixels are good to half a pixel (left=factory.yaml+-0.5); a number of a data sheet
-(left.fx=1330+-5) or of a drawing (left.tx=0.1+-0.0005, metres in the rig's frame). A prior that the images contradict
-is reported in sigmas, and its standard deviations are enlarged until they hold. --hold takes the same without +-: those
-numbers stay as they are, and a warning says if the images would change them. --hold rig.json holds every lens that the
-file has: the cameras' places alone are solved.
+(left.fx=1330+-5) or of a drawing (left.tx=0.1+-0.0005, metres in the rig's frame; left.ry=0.26+-0.01, radians of the
+rotation vector of T_rig_camera: 15 degrees to the right). A prior that the images contradict is reported in sigmas, and
+its standard deviations are enlarged until they hold. --hold takes the same without +-: those numbers stay as they are,
+and a warning says if the images would change them. --hold rig.json holds every lens that the file has: the cameras'
+places alone are solved.
 
 The first line after the pairing says whether the result may be used: `usable`, `usable with care` and why, or `not
 usable` and why; then rig.json is not written, and the exit code is 1, as where images leave a camera open (one view,

@@ -18,7 +18,7 @@ from cairn_calib.board.board_flatness import flat_view, straight_view
 from cairn_calib.board.corner_detection import normalise_contrast
 from cairn_calib.board.corner_gates import sound_corners
 from cairn_calib.board.corner_refinement import fit_corners
-from cairn_calib.board.corners import FOUND, Attempt, Corners, Detection
+from cairn_calib.board.corners import BY_HAND, FOUND, Attempt, Corners, Detection
 from cairn_calib.board.grid_fit import CELL_PX, fit_sharpest, reduce_image
 from cairn_calib.board.homography import fit_homography, map_points, steps_between
 from cairn_calib.board.polarity import PolarityCandidates
@@ -67,7 +67,7 @@ def coded_candidates(
         pointed: pixels of the four outer points, or of all, to about a tenth of a pitch.
     """
     if pointed is not None:
-        return _candidates(_point(counts, board, pointed), "by hand", 1.0, [], None)
+        return _candidates(_point(counts, board, pointed), BY_HAND, 1.0, [], None)
     ways: tuple[Polarity, ...] = ("normal", "reversed") if polarity == "vote" else (polarity,)
     attempts: list[Attempt] = []
     level = normalise_contrast(counts)

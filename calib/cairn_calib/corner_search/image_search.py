@@ -16,7 +16,7 @@ from cairn_calib.board.board import Board, Polarity
 from cairn_calib.board.corner_detection import grey
 from cairn_calib.board.corner_file import CornerFile, corner_file, read_corner_file
 from cairn_calib.board.corner_pictures import encode_picture, overlay
-from cairn_calib.board.corners import Attempt, Detection
+from cairn_calib.board.corners import BY_HAND, NOT_REFUSED, Attempt, Detection
 from cairn_calib.board.discs.disc_grid import disc_candidates
 from cairn_calib.board.polarity import PolarityCandidates, chessboard_candidates, reverse_corners
 from cairn_calib.board.still_frames import StillImage, read_still, refuse_movement
@@ -24,8 +24,6 @@ from cairn_calib.corner_search.coded_search import coded_candidates
 from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError, DamagedDataError
 
-BY_HAND = "by hand"
-"""Method of corners that a person pointed at."""
 READING, REPEATED, FAILED = UNSEARCHED = "reading", "repeated", "failed"
 """Stages of images in which no corners were searched, or whose search broke off."""
 
@@ -138,9 +136,10 @@ def outcome_line(document: CornerFile) -> str:
         furthest = max(document.attempts, key=lambda attempt: attempt.stage != "candidates")
         return f"{document.image}: no board ({furthest.stage}: {furthest.reason})"
     sigma = float(np.sqrt(np.nanmedian(np.trace(corners.covariance_px2, axis1=1, axis2=2) / 2)))
+    _, odd, why = last.reason.partition(f"; {NOT_REFUSED}")
     return (
         f"{document.image}: {corners.seen.sum()} of {len(corners.seen)} corners, sigma {sigma:.3f} px "
-        f"({last.method} x{last.scale:g})"
+        f"({last.method} x{last.scale:g}){odd}{why}"
     )
 
 

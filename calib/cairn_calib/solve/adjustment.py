@@ -16,7 +16,7 @@ from cairn_calib.board.board import Board
 from cairn_calib.solve.corner_residuals import CornerData, corner_block
 from cairn_calib.solve.normal_equations import Block, Loss, NormalEquations, Uncertainty, sum_blocks, uncertainty
 from cairn_calib.solve.range_residuals import RangeData, range_block
-from cairn_calib.solve.rig_state import ParameterLayout, RigState, known_values, step_state, warp_shape
+from cairn_calib.solve.rig_state import ParameterLayout, RigState, known_by_step, known_values, step_state, warp_shape
 from cairn_calib.solve.solve_plan import KnownNumbers, NoisePlan, Prior
 from cairn_map.arrays import Flags, Floats
 
@@ -103,11 +103,12 @@ class AdjustmentProblem:
         """Normal equations at a state: the sum of all blocks and of the priors."""
         normal = sum_blocks(blocks, self.layout.size, len(state.T_rig_board))
         A, a, cost = normal.A.copy(), normal.a.copy(), normal.cost
-        values = known_values(state, self.layout)
+        values, by_step = known_values(state, self.layout), known_by_step(state, self.layout)
         for prior in (*self.priors, *(prior for each in self.known for prior in each.priors())):
             # A prior is one more residual, (row . values - value) / sigma.
             row = self.prior_row(prior)
             miss = float(row @ values - prior.value) / prior.sigma
+            row = row @ by_step
             A += np.outer(row, row) / prior.sigma**2
             a -= row * miss / prior.sigma
             cost += miss**2

@@ -14,7 +14,7 @@ import numpy as np
 
 from cairn_calib.solve.adjustment import WARM, Adjustment, descend
 from cairn_calib.solve.normal_equations import uncertainty
-from cairn_calib.solve.rig_state import known_values
+from cairn_calib.solve.rig_state import known_by_step, known_values
 from cairn_calib.solve.solve_plan import KnownNumbers
 from cairn_map.arrays import Floats
 
@@ -124,5 +124,6 @@ def _residual(done: Adjustment, known: KnownNumbers) -> tuple[Floats, Floats, Fl
     layout = done.problem.layout
     rows = [layout.names.index((known.camera, name)) for name in known.names]
     values = known_values(done.state, layout)[rows]
-    covariance = uncertainty(done.normal).shared[np.ix_(rows, rows)]
+    by_step = known_by_step(done.state, layout)[rows]
+    covariance = by_step @ uncertainty(done.normal).shared @ by_step.T
     return values - known.values, known.scale**2 * known.covariance, covariance

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from cairn_calib.board.board import Board
 from cairn_calib.rig.calibration import POSE_UNITS
 from cairn_calib.rig.lens import Lens
-from cairn_calib.rig.pose_vectors import rotation_from_vector
+from cairn_calib.rig.pose_vectors import left_jacobian, rotation_from_vector, vector_from_transform
 from cairn_calib.solve.solve_plan import SHARED, SolvePlan
 from cairn_map.arrays import Floats
 
@@ -116,11 +116,23 @@ def shared_values(state: RigState, layout: ParameterLayout) -> Floats:
 
 
 def known_values(state: RigState, layout: ParameterLayout) -> Floats:
-    """`shared_values` with each camera's place (metres, rig frame) instead of the errors 0 of its translation."""
+    """`shared_values` with each camera's place in the rig, rotation vector (radians) and metres, for its errors 0."""
     values = shared_values(state, layout)
     for T, at in zip(state.T_rig_camera, layout.pose_at, strict=True):
-        values[at[3:]] = T[:3, 3][: len(at[3:])]
+        if len(at):
+            values[at] = vector_from_transform(T)
     return values
+
+
+def known_by_step(state: RigState, layout: ParameterLayout) -> Floats:
+    """(P, P) derivatives of `known_values` by the shared part of a step."""
+    derivatives = np.eye(layout.size)
+    for T, at in zip(state.T_rig_camera, layout.pose_at, strict=True):
+        if len(at):
+            # exp(r) R = exp(v + dv) turns by r = J_l(v) dv.
+            turn = np.ix_(at[:3], at[:3])
+            derivatives[turn] = np.linalg.inv(left_jacobian(vector_from_transform(T)[:3]))
+    return derivatives
 
 
 def step_state(state: RigState, layout: ParameterLayout, shared: Floats, boards: Floats) -> RigState:

@@ -51,7 +51,8 @@ class KnownNumbers:
     source: str
     """Origin, for people."""
     names: tuple[str, ...]
-    """K intrinsics, or `tx`, `ty`, `tz`: its place in the rig's frame, metres."""
+    """K intrinsics, or numbers of its place in the rig's frame: `tx`, `ty`, `tz`, metres, and the rotation vector of
+    T_rig_camera `rx`, `ry`, `rz`, radians."""
     values: Floats
     """(K,)"""
     covariance: Floats

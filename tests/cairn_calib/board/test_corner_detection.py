@@ -137,6 +137,24 @@ def test_four_corners_pointed_at_by_hand_find_the_rest() -> None:
     assert corners.seen.sum() > 50
 
 
+def test_who_points_at_corners_has_the_last_word_where_some_are() -> None:
+    image, at = seen(TOF, 5)
+    # A whole side is hidden, so that a search cannot tell which rows these are.
+    covered = image.copy()
+    side = np.array([at[n] for n in (0, 8, 17, 9)]) + 0.3 * (at[[0, 8, 17, 9]] - at[26])
+    cv2.fillConvexPoly(covered, cv2.convexHull(side.astype(np.float32)).astype(np.int32), float(np.median(image)))
+    assert find_chessboard(covered, BOARD).corners is None
+    detection = fit_pointed_at(covered, BOARD, at)
+    corners = found(detection)
+    assert corners.seen.sum() >= 30 and np.abs(corners.pixels - at)[corners.seen].max() < 0.3
+    assert "not refused, since it is pointed at" in detection.attempts[-1].reason
+    # But where there are none, or in the order of a mirrored board, nothing can be used.
+    noise = np.random.default_rng(1).normal(1000, 30, image.shape)
+    assert fit_pointed_at(noise, BOARD, at).corners is None
+    mirrored = at.reshape(6, 9, 2)[:, ::-1].reshape(-1, 2)
+    assert "mirrored" in fit_pointed_at(image, BOARD, mirrored).attempts[-1].reason
+
+
 def test_windows_without_an_edge_are_no_corners_and_no_error() -> None:
     guesses, steps = np.array([[20.0, 20.0], [60.0, 20.0]]), np.tile(8 * np.eye(2), (2, 1, 1))
     for contrast in (0.0, 1e-6, 1.0):

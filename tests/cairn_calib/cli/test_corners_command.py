@@ -77,7 +77,7 @@ def test_an_image_that_cannot_be_read_is_named_and_the_others_are_done(
         read_board_views({"tof": out})
 
 
-def test_corners_pointed_at_by_hand_are_taken_from_the_file(tmp_path: Path) -> None:
+def test_corners_pointed_at_by_hand_are_taken_from_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rng = np.random.default_rng(4)
     T_camera_board = pose(rng, TOF)
     at = truth(TOF, T_camera_board)
@@ -88,6 +88,15 @@ def test_corners_pointed_at_by_hand_are_taken_from_the_file(tmp_path: Path) -> N
     assert main([str(tmp_path / "one.png"), *options, str(tmp_path / "by-hand.json")]) == 0
     document = read_corner_file(tmp_path / "out" / "one.json")
     assert document.attempts[-1].method == "by hand"
+    # What a search would have refused, here a board that goes on, is used and said.
+    pointed["images"] = {"one.png": at[[0, 6, 51, 45]].tolist()}
+    (tmp_path / "by-hand.json").write_text(json.dumps(pointed))
+    smaller = ["--board", "7x6", *options[2:], str(tmp_path / "by-hand.json")]
+    capsys.readouterr()
+    assert main([str(tmp_path / "one.png"), *smaller]) == 0
+    line = capsys.readouterr().err.splitlines()[0]
+    assert line.startswith("one.png: 42 of 42 corners") and "; not refused, since it is pointed at: the pattern" in line
+    pointed["images"] = {"one.png": at[[0, 8, 53, 45]].tolist()}
     named_alike = tmp_path / "out" / "one.json"
     named_alike.write_text(json.dumps(pointed))
     with pytest.raises(BadInputError, match="would overwrite"):

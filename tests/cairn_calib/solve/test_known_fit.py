@@ -8,6 +8,8 @@ from tests.fixtures.calib.simulated_views import LENSES, SPECTRA, errors_of, vie
 
 from cairn_calib.diagnosis.examination import examine
 from cairn_calib.diagnosis.held_numbers import held_fits
+from cairn_calib.rig.pose_vectors import transform_from_vector, vector_from_transform
+from cairn_calib.solve.rig_state import known_by_step, known_values, step_state
 from cairn_calib.solve.solution import Solution
 from cairn_calib.solve.solve import solve_rig
 from cairn_calib.solve.solve_plan import CameraPlan, KnownNumbers, SolvePlan, usual_plan
@@ -122,6 +124,32 @@ def test_a_prior_that_holds_is_left_as_it_is() -> None:
         assert solution.sigmas()["left", "tx"] <= 1.001e-4
         off.append(errors_of(solution, truth)["left", "tx"])
     assert np.abs(off).max() < 4e-4
+
+
+def test_a_turn_by_a_drawing_is_kept_as_certain_as_it_is_stated() -> None:
+    turn = vector_from_transform(TRUTH.T_rig_camera("left"))[:3]
+    known = tuple(
+        KnownNumbers.single("left", "drawing", name, float(value), 1e-5)
+        for name, value in zip(("rx", "ry", "rz"), turn, strict=True)
+    )
+    solution = solve_rig(VIEWS, replace(PLAN, known=known))
+    assert [fit.contradicts for fit in solution.known] == [False] * 3
+    assert vector_from_transform(solution.state.T_rig_camera[1])[:3] == pytest.approx(turn, abs=4e-5)
+    assert all(solution.sigmas()["left", name] < 1.001e-5 for name in ("rx", "ry", "rz"))
+    off = KnownNumbers.single("left", "drawing", "ry", float(turn[1]) + 0.05, 1e-3)
+    (fit,) = solve_rig(VIEWS, replace(PLAN, known=(off,))).known
+    assert fit.sigmas > 10
+
+
+def test_known_numbers_move_with_a_step_as_their_derivatives_say(joint: Solution) -> None:
+    rng, layout, state = np.random.default_rng(2), joint.layout, joint.state
+    T = state.T_rig_camera.copy()
+    T[1] = transform_from_vector(np.array([0.7, -1.1, 0.4, 0.1, 0.2, 0.3]))
+    state = replace(state, T_rig_camera=T)
+    step = 1e-6 * rng.normal(size=layout.size)
+    still = np.zeros((len(state.T_rig_board), 6))
+    values = [known_values(step_state(state, layout, way * step, still), layout) for way in (1, -1)]
+    assert (values[0] - values[1]) / 2 == pytest.approx(known_by_step(state, layout) @ step, abs=1e-9)
 
 
 def test_a_held_lens_that_the_images_contradict_is_reported(joint: Solution) -> None:

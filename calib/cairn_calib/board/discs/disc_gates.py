@@ -15,6 +15,7 @@ from cairn_calib.board.corners import Corners
 from cairn_calib.board.discs.disc_lattice import NamedDiscs
 from cairn_calib.board.discs.disc_outline import HARMONIC_SIGMAS, DiscFit, Outline
 from cairn_calib.board.discs.local_map import local_map, predicted_by_others
+from cairn_calib.board.discs.straightening import board_view
 from cairn_map.arrays import Flags, Floats
 
 SEEN_MIN = 0.9
@@ -75,8 +76,11 @@ def neighbour_step(board: Board) -> float:
     return float(np.sqrt(2.0)) if board.pattern == "asymmetric-circles" else 1.0
 
 
-def sound_discs(board: Board, fits: Sequence[DiscFit | None]) -> Flags:
-    """(N,) True for each fit that is a disc of this board: alike in contrast, crispness, size, roundness and place."""
+def sound_discs(board: Board, fits: Sequence[DiscFit | None], shape: tuple[int, ...]) -> Flags:
+    """(N,) True for each fit that is a disc of this board: alike in contrast, crispness, size, roundness and place.
+
+    `shape` is that of the image.
+    """
     there = np.array([each is not None for each in fits])
     if there.sum() < DISCS_MIN:
         return np.zeros(len(fits), np.bool_)
@@ -88,7 +92,7 @@ def sound_discs(board: Board, fits: Sequence[DiscFit | None]) -> Flags:
         sound &= misfit < min(MISFIT_MAX, MISFIT_RATIO * float(np.nanmedian(misfit)) + MISFIT_SPARE)
     # Strays last, the worst first, since they spoil the predictions of those around them.
     while sound.sum() >= DISCS_MIN:
-        off = _oddness(board, fits, sound)
+        off = _oddness(board, fits, sound, shape)
         worst = int(np.argmax(off))
         if off[worst] <= 1:
             break
@@ -96,23 +100,30 @@ def sound_discs(board: Board, fits: Sequence[DiscFit | None]) -> Flags:
     return np.asarray(sound)
 
 
-def _oddness(board: Board, fits: Sequence[DiscFit | None], sound: Flags) -> Floats:
+def _oddness(board: Board, fits: Sequence[DiscFit | None], sound: Flags, shape: tuple[int, ...]) -> Floats:
     """(N,) by how much each sound disc is too large, too long or out of place; 1 is the most that is allowed."""
     lattice, step = board.lattice()[sound], neighbour_step(board)
     kept = [each for each, right in zip(fits, sound, strict=True) if right and each is not None]
-    pixels = np.array([each.centroid for each in kept])
-    _, steps = local_map(lattice, pixels, lattice, step=step)
-    # The disc on the board: its image's ellipse in units of the steps there.
-    if np.linalg.det(steps).min() < 1e-3:
+    found, ellipses = (
+        np.array(each) for each in zip(*((each.centroid, ellipse_of(each.outline)) for each in kept), strict=True)
+    )
+    # On the board, as far as a homography and the lens's strongest bending say; parabolas follow the rest.
+    view = board_view(lattice, found, shape)
+    places, shrink = view.places(found), view.jacobian(found)
+    _, steps = local_map(lattice, places, lattice, step=step)
+    # Folded, or mirrored.
+    if np.linalg.det(steps).min() < 1e-3 or not np.linalg.det(np.nan_to_num(shrink)).min() > 0:
         return np.where(sound, 9.0, 0.0)
-    own = np.linalg.inv(np.swapaxes(steps, 1, 2)) @ np.array([ellipse_of(each.outline) for each in kept])
+    # The disc on the board: its image's ellipse in units of the steps there.
+    own = np.linalg.inv(np.swapaxes(steps, 1, 2)) @ shrink @ ellipses
     axes = np.linalg.svd(own, compute_uv=False)
     radius = np.sqrt(axes[:, 0] * axes[:, 1])
     size = np.exp(np.abs(np.log(radius / np.median(radius))))
-    miss = np.linalg.norm(predicted_by_others(lattice, pixels, step=step) - pixels, axis=1)
+    miss = np.linalg.norm(predicted_by_others(lattice, places, step=step) - places, axis=1)
     length = np.sqrt(np.abs(np.linalg.det(steps))) * step
     off = np.maximum(np.log(size) / np.log(RADIUS_RATIO), np.log(axes[:, 0] / axes[:, 1]) / np.log(ROUND_RATIO))
-    off = np.maximum(off, miss / (MISS_STEPS * length + MISS_PX))
+    pixel = np.sqrt(np.abs(np.linalg.det(shrink)))
+    off = np.maximum(off, miss / (MISS_STEPS * length + MISS_PX * pixel))
     low, high = DISC_PITCHES
     off = np.where((2 * radius > low * step) & (2 * radius < high * step), off, 9.0)
     result = np.zeros(len(sound))

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from cairn_calib.board.board import Board, Polarity
 from cairn_calib.board.corner_detection import grey
-from cairn_calib.board.corners import FOUND, Attempt, Detection
+from cairn_calib.board.corners import BY_HAND, FOUND, Attempt, Detection, pointed_attempt
 from cairn_calib.board.discs.blobs import FINEST_PX, Blobs, blob_ladder, merge
 from cairn_calib.board.discs.disc_gates import DISCS_MIN, GridFit, disc_pitches, neighbour_step, refusal
 from cairn_calib.board.discs.disc_lattice import NamedDiscs, Place, lattice_of, name_discs, sides, walk_from, walks
@@ -89,7 +89,7 @@ def _in_blobs(dark: Image, board: Board, blobs: Blobs, *, upright: bool) -> Grid
             more, lattice = grow(dark, board, blobs, walk)
             named = name_discs(lattice, board, more.centres, upright=upright)
         largest = max(largest, len(lattice))
-        found = _best_named(dark, board, more, named)
+        found = _best_named(dark, board, more, named, upright=upright)
         if isinstance(found, GridFit):
             return found
         best = best or found
@@ -103,20 +103,21 @@ def _in_blobs(dark: Image, board: Board, blobs: Blobs, *, upright: bool) -> Grid
 
 
 def _best_named(
-    dark: Image, board: Board, blobs: Blobs, named: Sequence[NamedDiscs]
+    dark: Image, board: Board, blobs: Blobs, named: Sequence[NamedDiscs], *, upright: bool
 ) -> GridFit | tuple[str, str] | None:
     """The grid by the names under which the fewest discs are missing inside the image."""
     if not named:
         return None
-    # A disc that is missing inside the image speaks against a name, one beyond its border does not.
-    lost = [missing_in_view(dark, board, blobs, each) for each in named]
-    order = np.argsort(lost, kind="stable")
+    # A disc that is missing inside the image speaks against a name, one beyond its border does not; of two that are
+    # as good the one that leans less is taken, if the board is known to be upright.
+    lost = [(missing_in_view(dark, board, blobs, each), upright and each.is_leaning) for each in named]
+    order = sorted(range(len(named)), key=lost.__getitem__)
     if len(named) > 1 and lost[order[0]] == lost[order[1]]:
         return "names", (
             f"{int(named[0].met.sum())} of {board.count} discs are there, and which ones of the board's they are is "
             "open: show at least one more row and column, or the end of the board"
         )
-    best = named[int(order[0])]
+    best = named[order[0]]
     found = fit_grid(dark, board, blobs, best)
     if found is None:
         return None
@@ -140,7 +141,7 @@ def fit_pointed_discs(
     found, named = _at_pointed(dark, board, pointed)
     if found is None:
         reason = "the discs pointed at lie on a line: name them in the order that the help shows"
-        return Detection(None, (Attempt("by hand", 1.0, "candidates", reason),))
+        return Detection(None, (Attempt(BY_HAND, 1.0, "candidates", reason),))
     # Gates are asked, but every fit counts, be it odd.
     odd = refusal(found, named)
     there = np.array([each is not None and _is_certain(each) for each in found.fits])
@@ -151,10 +152,8 @@ def fit_pointed_discs(
             f"at {there.sum()} of {board.count} places is a disc {kind} than its ground, at least {DISCS_MIN} must be: "
             "point at all discs, each to a third of its diameter"
         )
-        return Detection(None, (Attempt("by hand", 1.0, "refinement", reason),))
-    doubt = "" if odd is None else f"; not refused, since it is pointed at: {odd[1]}"
-    attempt = Attempt("by hand", 1.0, FOUND, f"{_seen_text(chosen)}{doubt}")
-    return Detection(chosen.corners(), (attempt,), disc_pitches(chosen))
+        return Detection(None, (Attempt(BY_HAND, 1.0, "refinement", reason),))
+    return Detection(chosen.corners(), (pointed_attempt(_seen_text(chosen), odd),), disc_pitches(chosen))
 
 
 def _is_certain(fit: DiscFit) -> bool:

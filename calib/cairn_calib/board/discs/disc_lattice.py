@@ -55,6 +55,8 @@ class NamedDiscs:
     """(N,) index of each point's blob; -1 where the walk met none."""
     beyond: int
     """Discs of the same lattice next to the board's rim, which belong to a larger pattern."""
+    is_leaning: bool = False
+    """True if the board's rows run more than 45 degrees from the image's rows."""
 
     @property
     def met(self) -> Flags:
@@ -237,12 +239,14 @@ def lattice_of(board: Board) -> npt.NDArray[np.intp]:
 def name_discs(lattice: dict[Place, int], board: Board, centres: Floats, *, upright: bool) -> list[NamedDiscs]:
     """The board's names for a walked lattice, in all turns and places that meet the most discs of it.
 
-    None where no turn and place meets half of the board.
+    None where no turn and place meets half of the board. With `upright`, the board's rows run within 90 degrees of the
+    image's rows, to the right; of a square board within 45.
     """
     # Both as whole numbers on the square lattice.
     walked = np.array(list(lattice), np.intp)
     blobs = np.array([lattice[place] for place in lattice], np.intp)
     mine = lattice_of(board)
+    is_square = board.pattern == "circles" and board.columns == board.rows
     best: list[NamedDiscs] = []
     most = int(np.ceil(SEEN_MIN * board.count))
     for turn in TURNS:
@@ -265,11 +269,15 @@ def name_discs(lattice: dict[Place, int], board: Board, centres: Floats, *, upri
                 at = rim + np.array([i, j])
                 inside = ((at >= 0) & (at < size)).all(axis=1)
                 beyond = int((there[tuple(at[inside].T)] >= 0).sum())
-                if met - beyond < most or (upright and not _is_upright(named, board, centres)):
+                if met - beyond < most:
+                    continue
+                right, down = _rows_direction(named, board, centres)
+                is_leaning = right <= abs(down)
+                if upright and (right <= 0 or (is_leaning and is_square)):
                     continue
                 best = [each for each in best if int(each.met.sum()) - each.beyond >= met - beyond]
                 most = met - beyond
-                best.append(NamedDiscs(named, beyond))
+                best.append(NamedDiscs(named, beyond, is_leaning))
     return best
 
 
@@ -280,10 +288,10 @@ def _rim(places: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:
     return np.array(sorted(around), np.intp)
 
 
-def _is_upright(named: Indices, board: Board, centres: Floats) -> bool:
-    """True if the board's rows run to the right in the image, within 45 degrees."""
+def _rows_direction(named: Indices, board: Board, centres: Floats) -> tuple[float, float]:
+    """Direction in which the board's rows run in the image: to the right, and down."""
     there = named >= 0
-    # The direction of rows: least squares of pixels over columns and rows.
+    # Least squares of pixels over columns and rows.
     terms = np.column_stack([board.lattice()[there], np.ones(int(there.sum()))])
-    right = np.linalg.lstsq(terms, centres[named[there]], rcond=None)[0][0]
-    return bool(right[0] > abs(right[1]))
+    right, down = np.linalg.lstsq(terms, centres[named[there]], rcond=None)[0][0]
+    return float(right), float(down)

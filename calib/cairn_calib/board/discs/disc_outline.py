@@ -76,8 +76,15 @@ class Outline:
 
     def rim(self) -> Floats:
         """(64, 2) pixels along the curve."""
-        radius = 1 + _waves(RIM) @ self.harmonics
-        return np.asarray(self.centre + (radius[:, None] * np.stack([np.cos(RIM), np.sin(RIM)], axis=1)) @ self.shape.T)
+        radius = 1 + _RIM_WAVES @ self.harmonics
+        return np.asarray(self.centre + (radius[:, None] * _RIM_UNITS) @ self.shape.T)
+
+    def reach_px(self) -> float:
+        """Distance from the centre that no point of the curve exceeds, pixels."""
+        # The larger singular value of the shape, times the most that harmonics add.
+        squares, determinant = float((self.shape**2).sum()), float(np.linalg.det(self.shape))
+        largest = np.sqrt((squares + np.sqrt(max(squares**2 - 4 * determinant**2, 0.0))) / 2)
+        return float(largest * (1 + np.abs(self.harmonics).sum()))
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,15 +128,21 @@ def fit_outlines(dark: Image, outlines: Sequence[Outline | None]) -> list[DiscFi
         return first
     # One lens, one blur: the usual one starts the second fit.
     blur = float(np.median([each.outline.blur_px for each in found]))
+    centres = np.array([each.outline.centre for each in found])
+    reaches = np.array([each.outline.reach_px() for each in found])
     again: list[DiscFit | None] = []
     for each in first:
         if each is None:
             again.append(None)
             continue
-        # Neighbours whose blur reaches into this band.
+        # Neighbours whose blur reaches into this band; most are farther off than any outline reaches.
         start = replace(each.outline, blur_px=blur)
+        widest, reach = 2 * (BAND_BLURS * blur + BAND_PX), each.outline.reach_px()
+        away = np.linalg.norm(centres - each.outline.centre, axis=1)
         near = [
-            other for other in found if other is not each and _gap_px(each, other) < 2 * (BAND_BLURS * blur + BAND_PX)
+            found[n]
+            for n in np.flatnonzero(away < widest + reach + reaches).tolist()
+            if found[n] is not each and _gap_px(each, found[n]) < widest
         ]
         again.append(_fit(dark, start, [], near) or each)
     return again
@@ -238,8 +251,10 @@ def _band(
     kept = np.abs(distance) < half
     pixels, distance = pixels[kept], distance[kept]
     # Before the neighbours are fitted each pixel belongs to the nearest outline.
+    reach = start.reach_px() if excluding else 0.0
     for other in excluding:
-        if np.linalg.norm(other.centre - start.centre) > 4 * (start.radius_px + other.radius_px) + 2 * half:
+        # No pixel of this band is as near to the other outline.
+        if float(np.linalg.norm(other.centre - start.centre)) > reach + other.reach_px() + 2 * half:
             continue
         nearer = _distances(other, pixels)[0] < distance
         pixels, distance = pixels[~nearer], distance[~nearer]
@@ -273,18 +288,23 @@ def _waves_of(cosine: Floats, sine: Floats) -> Floats:
     return waves
 
 
+_RIM_UNITS = np.stack([np.cos(RIM), np.sin(RIM)], axis=1)
+_RIM_WAVES = _waves(RIM)
+
+
 def _surface(at: Floats) -> Floats:
     """(P, 5) 1, u, v, u^2 - v^2, 2 u v."""
     u, v = at.T
     return np.stack([np.ones_like(u), u, v, u * u - v * v, 2 * u * v], axis=1)
 
 
-_ERF = np.array([erf(x) for x in np.linspace(-5, 5, 4001)])
+_ERF_AT = np.linspace(-5, 5, 4001)
+_ERF = np.array([erf(x) for x in _ERF_AT])
 
 
 def _cover(x: Floats) -> Floats:
     """Phi(-x): share of a blurred pixel within the outline at x blurs outside of it."""
-    return np.asarray(0.5 - 0.5 * np.interp(x / np.sqrt(2), np.linspace(-5, 5, 4001), _ERF))
+    return np.asarray(0.5 - 0.5 * np.interp(x / np.sqrt(2), _ERF_AT, _ERF))
 
 
 def _distances(outline: Outline, pixels: Floats) -> tuple[Floats, Floats, Floats]:
@@ -376,13 +396,10 @@ def _result(
     # Ragged edges: more than independent noise.
     covariance *= _raggedness(outline, pixels, J, residual, noise)
     # The centroid moves with the centre, and with the harmonics by how they shift the region.
-    shift = _shift(outline)
+    shift, *moved = _shifts(outline.shape, outline.harmonics + np.vstack([np.zeros(7), 1e-4 * np.eye(7)]))
     by = np.zeros((2, 20))
     by[:, :2] = np.eye(2)
-    for n in range(7):
-        moved = outline.harmonics.copy()
-        moved[n] += 1e-4
-        by[:, 2 + n] = (_shift(replace(outline, harmonics=moved)) - shift) / 1e-4
+    by[:, 2:9] = (np.array(moved) - shift).T / 1e-4
     return DiscFit(
         outline,
         outline.centre + shift,
@@ -395,12 +412,13 @@ def _result(
     )
 
 
-def _shift(outline: Outline) -> Floats:
-    """(2,) from the centre to the centroid of the region: of the polygon of its rim, by cross products."""
-    at = outline.rim() - outline.centre
-    after = np.roll(at, -1, axis=0)
-    cross = at[:, 0] * after[:, 1] - after[:, 0] * at[:, 1]
-    return np.asarray(((at + after) * cross[:, None]).sum(axis=0) / (3 * cross.sum()))
+def _shifts(shape: Floats, harmonics: Floats) -> Floats:
+    """(K, 2) from the centre to the centroid of the region of (K, 7) harmonics: of the polygon of its rim."""
+    at = ((1 + harmonics @ _RIM_WAVES.T)[..., None] * _RIM_UNITS) @ shape.T
+    after = np.roll(at, -1, axis=1)
+    # Centroid of a polygon by cross products.
+    cross = at[..., 0] * after[..., 1] - after[..., 0] * at[..., 1]
+    return np.asarray(((at + after) * cross[..., None]).sum(axis=1) / (3 * cross.sum(axis=1, keepdims=True)))
 
 
 def _raggedness(outline: Outline, pixels: Floats, J: Floats, residual: Floats, noise: float) -> float:

@@ -112,7 +112,7 @@ def fit_grid(dark: Image, board: Board, blobs: Blobs, named: NamedDiscs) -> Grid
         seen = fitted.outline if fitted else None
         outlines.append(guess if met[n] and in_view[n] else seen)
     fits = fit_outlines(dark, outlines)
-    return GridFit(board, tuple(fits), sound_discs(board, fits), in_view)
+    return GridFit(board, tuple(fits), sound_discs(board, fits, dark.shape), in_view)
 
 
 def is_inside(outline: Outline, shape: tuple[int, ...]) -> bool:

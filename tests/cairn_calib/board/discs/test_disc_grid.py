@@ -3,6 +3,7 @@
 import numpy as np
 from tests.fixtures.calib.board_images import DISCS, THERMAL, TOF, disc_centroids, picture, pose
 
+from cairn_calib.board.board import Board
 from cairn_calib.board.discs.disc_grid import find_circles
 
 
@@ -37,3 +38,15 @@ def test_a_chessboard_is_no_grid_of_discs() -> None:
     detection = find_circles(picture(TOF, pose(rng, TOF), rng), DISCS)
     assert detection.corners is None
     assert all(attempt.reason for attempt in detection.attempts)
+
+
+def test_discs_of_unequal_sides_are_named_from_the_left_at_any_roll() -> None:
+    board = Board(pattern="circles", columns=6, rows=4, pitch_m=0.06)
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        T = pose(rng, TOF, board=board, tilt_deg=25)
+        at = disc_centroids(TOF, T, board)
+        wanted = at if T[0, 0] > 0 else at[::-1]
+        corners = find_circles(picture(TOF, T, rng, board=board), board, upright=True).corners
+        assert corners is not None, seed
+        assert np.nanmax(np.abs(corners.pixels - wanted)) < 0.4, seed
