@@ -215,7 +215,7 @@ def evidence_of_view(view: View, geometry: Geometry, model: SensorModel) -> Evid
     if view.depth != geometry.depth or view.style.chance is not Chance.LOG_ODDS:
         raise BadInputError("bad_style", "a reading is made of a view of voxels with log-odds")
     low, high = log_odds(model.p_min), log_odds(model.p_max)
-    odds = np.clip((view.chances - LOG_ODDS_ZERO) * LOG_ODDS_STEP, low, high)
+    odds: Floats = np.clip((view.chances - LOG_ODDS_ZERO) * LOG_ODDS_STEP, low, high).astype(np.float64)
     is_occupied = odds > log_odds(model.p_occupied)
     samples = np.zeros((len(view), geometry.plane_count), np.int64)
     _put_samples(samples, view.coloured, view.colour.astype(np.float64), geometry, ChannelKind.COLOUR)
