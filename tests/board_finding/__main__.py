@@ -9,7 +9,8 @@
 
 Boards vary in distance, tilt (up to 45 degrees), blur, noise (contrast 10 times it or more) and polarity. In
 time-of-flight images cells are 4 px or more. A board counts as found if each of its points lies where it is, in order.
-`--seed` draws others. Exit code 1 if fewer than 99 % are found, any grid is false, or any image votes wrongly.
+`--seed` draws others. Exit code 1 if fewer than 99 % are found (98 % through lenses of up to 150 degrees), any grid is
+false, any image votes wrongly, or more than 1 % of the discs' centroids are beyond 3 of their stated sigmas.
 """
 
 import argparse
@@ -27,7 +28,7 @@ from tests.fixtures.calib.board_images import BOARD
 from cairn_calib.board.corner_detection import find_chessboard
 
 FOUND_MIN = 0.99
-LENSES_MIN = 0.9
+LENSES_MIN = 0.98
 """Least share found of boards through lenses of up to 150 degrees, leaning by up to 50, next to clutter."""
 EMPTY = np.zeros((0, 0), np.uint8)
 TABLE = (("cells", "cell_px", (4, 6, 10, 40, 400)), ("tilt", "tilt_deg", (0, 15, 30, 45.1)))
