@@ -12,7 +12,7 @@ FOUND = "found"
 BY_HAND = "by hand"
 """Method of points that a person pointed at."""
 NOT_REFUSED = "not refused, since it is pointed at"
-"""What is said of points by hand that a gate would have refused, before its reason."""
+"""Words before the reason of a gate that would have refused points by hand."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -52,6 +52,7 @@ def fit_board(
     found = _fit_reduced(grid, counts, board, factor)
     if found is None:
         return NO_FIT
+    # Gates judge the board in its own order, at the reduced scale.
     found = order(found)
     return refusal(found) or _sharpen(found, counts, factor)
 
@@ -66,8 +67,10 @@ def fit_pointed_board(grid: Floats, counts: Image, board: Board) -> tuple[Corner
     found = _fit_reduced(grid, counts, board, factor)
     if found is None:
         return None, NO_FIT
+    # No camera sees a board so, unless in a mirror: no answer to a wrong order would help a solve.
     if np.linalg.det(found.steps[found.kept]).max() < 0:
         return None, MIRRORED
+    # The gate's word goes with the corners, and does not keep them back.
     return _sharpen(found, counts, factor), refusal(found)
 
 

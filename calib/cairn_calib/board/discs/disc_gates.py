@@ -15,7 +15,7 @@ from cairn_calib.board.corners import Corners
 from cairn_calib.board.discs.disc_lattice import NamedDiscs
 from cairn_calib.board.discs.disc_outline import HARMONIC_SIGMAS, DiscFit, Outline
 from cairn_calib.board.discs.local_map import local_map, predicted_by_others
-from cairn_calib.board.discs.straightening import board_view
+from cairn_calib.board.discs.straightening import bent_view
 from cairn_map.arrays import Flags, Floats
 
 SEEN_MIN = 0.9
@@ -108,7 +108,7 @@ def _oddness(board: Board, fits: Sequence[DiscFit | None], sound: Flags, shape: 
         np.array(each) for each in zip(*((each.centroid, ellipse_of(each.outline)) for each in kept), strict=True)
     )
     # On the board, as far as a homography and the lens's strongest bending say; parabolas follow the rest.
-    view = board_view(lattice, found, shape)
+    view = bent_view(lattice, found, shape)
     places, shrink = view.places(found), view.jacobian(found)
     _, steps = local_map(lattice, places, lattice, step=step)
     # Folded, or mirrored.

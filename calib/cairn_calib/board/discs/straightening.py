@@ -49,7 +49,7 @@ class Straightening:
 
 
 @dataclass(frozen=True, slots=True)
-class BoardView:
+class BentView:
     """A map from an image's pixels to places of a board's lattice, true to some percent."""
 
     straightening: Straightening
@@ -69,7 +69,7 @@ class BoardView:
         return np.asarray(slopes / depth[:, None, None] @ self.straightening.jacobian(pixels))
 
 
-def board_view(lattice: Floats, pixels: Floats, shape: tuple[int, ...]) -> BoardView:
+def bent_view(lattice: Floats, pixels: Floats, shape: tuple[int, ...]) -> BentView:
     """The view that shows a lattice best; without perspective where no homography has all its places in front.
 
     Arguments are those of `straightening_of`.
@@ -82,7 +82,7 @@ def board_view(lattice: Floats, pixels: Floats, shape: tuple[int, ...]) -> Board
         terms = np.column_stack([straight, np.ones(len(straight))])
         affine = np.linalg.lstsq(terms, lattice, rcond=None)[0].T
         homography = np.vstack([affine, [0.0, 0.0, 1.0]])
-    return BoardView(straightening, homography)
+    return BentView(straightening, homography)
 
 
 def straightening_of(lattice: Floats, pixels: Floats, shape: tuple[int, ...]) -> Straightening:

@@ -4,7 +4,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from cairn_calib.board.discs.straightening import Straightening, board_view, straightening_of
+from cairn_calib.board.discs.straightening import Straightening, bent_view, straightening_of
 from cairn_calib.board.homography import map_points
 from cairn_calib.rig.fisheye import FisheyeCamera
 
@@ -24,7 +24,7 @@ def near_lattice() -> Floats:
 
 def test_places_on_the_board_are_nearly_its_lattice_and_move_as_their_derivatives_say() -> None:
     pixels = near_lattice()
-    view = board_view(LATTICE, pixels, SHAPE)
+    view = bent_view(LATTICE, pixels, SHAPE)
     assert np.abs(view.places(pixels) - LATTICE).max() < 0.1
     step = 1e-4 * np.random.default_rng(1).normal(size=pixels.shape)
     difference = view.places(pixels + step) - view.places(pixels - step)
