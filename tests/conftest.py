@@ -31,11 +31,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_sessionstart() -> None:
-    if os.environ.get("CAIRN_TEST_STORE") == "postgresql":
+    if os.environ.get("CAIRN_TEST_STORE") in ("postgresql", "replicas"):
         from tests.fixtures.server.database_stores import database_store
-        from tests.fixtures.server.stores import OPENERS
+        from tests.fixtures.server.stores import OPENERS, POSTGRESQL, REPLICAS
 
-        OPENERS["postgresql"] = database_store
+        OPENERS.update({POSTGRESQL: database_store, REPLICAS: database_store})
 
 
 @pytest.fixture(scope="session", autouse=True)

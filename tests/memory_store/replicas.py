@@ -105,6 +105,9 @@ class MemoryReports:
     def __init__(self, maps: MemoryMaps) -> None:
         self._maps = maps
 
+    def write_seen(self) -> None:
+        """Do nothing: what is heard of branches is written at once."""
+
     def put_status(self, row: MapRow, branch: str, status: str, *, heard_s: float) -> None:
         """Keep a status, unless a later one is kept."""
         with suppress(UnreachableError), self._maps.changing(row) as changed:

@@ -21,6 +21,7 @@ from tests.replicas.site import Site, crash_database, kill_and_start, sleep_thro
 
 from cairn_map.wire.messages import CreateMap
 from cairn_server.folding.store_check import check_map
+from cairn_server.store.objects.cold_bytes import ColdReads
 from cairn_server.store.postgres.store import PgStore
 
 SILENCE_MAX_S = 15.0
@@ -41,6 +42,10 @@ class FaultRun:
     seconds: float = 0.0
     folded_after_s: float = 0.0
     """Time from the last push until all was folded."""
+    reads: Counter[str] = field(default_factory=Counter)
+    """Count of each answer to a reader, where there are any."""
+    cold: dict[str, int] = field(default_factory=dict)
+    """Count of what is in an object store in the end."""
 
     @property
     def is_sound(self) -> bool:
@@ -53,6 +58,10 @@ class FaultRun:
         yield "acknowledged", f"{len(pushed.acked)} in {self.seconds:.0f} s"
         yield "faults", ", ".join(f"{count} x {what}" for what, count in sorted(self.faults.items()))
         yield "answers", ", ".join(f"{count} x {what}" for what, count in sorted(pushed.answers.items()))
+        if self.reads:
+            yield "cells that were read meanwhile", ", ".join(f"{n} x {what}" for what, n in sorted(self.reads.items()))
+        if self.cold:
+            yield "in the object store in the end", ", ".join(f"{n} {what}" for what, n in self.cold.items())
         yield "longest time without an acknowledgement", f"{pushed.silence_s:.1f} s"
         yield "folded after the last push", f"{self.folded_after_s:.1f} s"
         yield "lost, wrong", f"{len(self.verdict.lost)}, {self.verdict.wrong + pushed.wrong[:5]}"
@@ -80,7 +89,7 @@ def fault_run(
         site = Site(folder, postgres, "cairn")
         for role in ("server",) * servers + ("folder",) * folders:
             site.add(role)
-        faults = list(_faults(site))
+        faults = list(faults_of(site))
         chance.shuffle(faults)
         push_under_faults(site, found, faults, chance, seconds=seconds, robots=robots)
         site.close()
@@ -88,14 +97,21 @@ def fault_run(
 
 
 def push_under_faults(
-    site: Site, found: FaultRun, faults: list[Fault], chance: random.Random, *, seconds: float, robots: int
+    site: Site,
+    found: FaultRun,
+    faults: list[Fault],
+    chance: random.Random,
+    *,
+    seconds: float,
+    robots: int,
+    objects: ColdReads | None = None,
 ) -> None:
     """Push into a new map of a site that suffers faults, one after the other, and look at its store."""
     map_url = f"{site.urls()[0]}/maps/lab"
     body = CreateMap(geometry=SMALL).model_dump_json()
     httpx.put(map_url, content=body, headers={"Content-Type": "application/json"}).raise_for_status()
     _push(site, found, faults, chance, seconds=seconds, robots=robots)
-    _judge(site, found)
+    _judge(site, found, objects)
 
 
 def _push(
@@ -119,7 +135,8 @@ def _push(
     found.seconds = time.monotonic() - start_s
 
 
-def _faults(site: Site) -> Iterator[Fault]:
+def faults_of(site: Site) -> Iterator[Fault]:
+    """Faults of each process, and of the database."""
     for member in site.members:
         yield f"kill -9 of a {member.role}", kill_and_start(site, member)
         if member.role == "folder":
@@ -129,8 +146,8 @@ def _faults(site: Site) -> Iterator[Fault]:
     yield "crash of the database", crash_database(site)
 
 
-def _judge(site: Site, found: FaultRun) -> None:
-    store = PgStore(site.postgres.url(site.database))
+def _judge(site: Site, found: FaultRun, objects: ColdReads | None) -> None:
+    store = PgStore(site.postgres.url(site.database), objects=objects)
     try:
         row, last_s = store.map("lab"), time.monotonic()
         until(lambda: not store.waiting_maps(), "all is folded")

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from tests.fixtures.client.made import GEOMETRY, cells_of, random_diff
+from tests.fixtures.client.made import GEOMETRY, PLAIN, cells_of, random_diff
 
 from cairn_client.http.api import MapApi
 from cairn_client.http.http_link import Link
@@ -27,9 +27,9 @@ from cairn_client.sync.requests import Ask, GetMissing
 from cairn_client.sync.sync import fetch_cells, fetch_missing, push_commits
 from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.ids import CommitId, RobotName
+from cairn_map.epochs.history_map import HistoryMap
 from cairn_map.errors import CairnError, ConflictError, UnreachableError
 from cairn_map.evidence.evidence import Evidence
-from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.grid import CellKey, cell_key
 from cairn_map.wire.frames import CellFrame, FrameKind
 from cairn_map.wire.messages import ReplyHeader
@@ -82,7 +82,7 @@ class Team:
 
     def expected(self) -> Digests:
         """The map that is the sum of all commits."""
-        total = EvidenceMap(GEOMETRY)
+        total = HistoryMap(PLAIN)
         for commit, diff in self.diffs.items():
             if commit not in self.retracted:
                 total.merge(diff)
@@ -269,7 +269,7 @@ def settle(urls: list[str], map_name: str, team: Team, mappers: list[Mapper]) ->
     return seconds
 
 
-def digests_of(view: EvidenceMap) -> Digests:
+def digests_of(view: HistoryMap) -> Digests:
     """Digest of each cell that holds evidence."""
     return {key: digest.hex() for key, (digest, _) in cells_of(view).items()}
 

@@ -3,6 +3,7 @@
 robots map   |---------------------------------------|              |-----------|  all maps are compared
 database     |-- base backup --|-- T --|-------------|  restored to T  |
 log archive  |---------------------------------------|
+objects      |-------------------------------------------------- adopted --------|  all of them are read
 """
 
 import re
@@ -17,11 +18,15 @@ from pathlib import Path
 
 from tests.fixtures.pages import DOCS
 from tests.fixtures.server.deadline import until
+from tests.fixtures.server.object_store import ObjectServer
 from tests.fixtures.server.postgres import PostgresServer
 from tests.replicas.fault_run import postgres_in
 from tests.replicas.lost_tail import make_map
 from tests.replicas.mappers import mapping, settle
 from tests.replicas.site import Site
+
+from cairn_map.errors import DamagedDataError
+from cairn_server.operations.serve import main as serve
 
 NAME = "lab"
 ROBOTS = 3
@@ -81,8 +86,13 @@ def commands_of_page() -> Commands:
     return Commands(named, "\n".join(back_up), "\n".join(restore[:-1]))
 
 
-def restore_run(folder: Path, programs: Path, *, seconds: float, seed: int = 0) -> Restore:
-    """Let robots map for some seconds before and after a point in time, and restore it."""
+def restore_run(
+    folder: Path, programs: Path, *, seconds: float, seed: int = 0, objects: ObjectServer | None = None
+) -> Restore:
+    """Let robots map for some seconds before and after a point in time, and restore it.
+
+    With an object store all that is folded moves there at once, before and after.
+    """
     found, backup = Restore(), Path(tempfile.mkdtemp(prefix="cairn-backup-"))
     page = commands_of_page()
     backup.chmod(0o777)
@@ -91,7 +101,8 @@ def restore_run(folder: Path, programs: Path, *, seconds: float, seed: int = 0) 
     try:
         with postgres_in(programs, *(_here(setting, backup) for setting in page.settings)) as postgres:
             postgres.execute("CREATE DATABASE cairn")
-            site = Site(folder, postgres, "cairn")
+            place = _place_in(objects) if objects is not None else None
+            site = Site(folder, postgres, "cairn", options=_cold_options(folder, place))
             site.add_all("server", "both")
             make_map(site, NAME)
             with mapping(folder / "robots", site.urls, NAME, robots=ROBOTS, seed=seed) as (team, mappers):
@@ -106,14 +117,43 @@ def restore_run(folder: Path, programs: Path, *, seconds: float, seed: int = 0) 
                 found.left = _commits(postgres)
                 until(lambda: postgres.execute("SELECT pg_is_in_recovery()") == [(False,)], "it takes commits")
                 found.restored_s = time.monotonic() - start_s
+                if place is not None:
+                    assert serve(["adopt", "--store", postgres.url("cairn"), "--objects", place]) == 0
                 threading.Event().wait(seconds)
                 found.refilled_s = seconds + settle(site.urls(), NAME, team, mappers)
+            if place is not None:
+                found.wrong += _of_objects(postgres, place)
             site.close()
     finally:
         shutil.rmtree(backup)
     found.acked, found.answers = len(team.acked), team.answers
     found.misfits, found.wrong = team.misfits, team.wrong
     return found
+
+
+def _place_in(objects: ObjectServer) -> str:
+    place = objects.new_place()
+    objects.bucket(place)  # programs find it from here on
+    return place
+
+
+def _cold_options(folder: Path, place: str | None) -> tuple[str, ...]:
+    """Options under which bytes move as soon as they are folded, and objects stay for longer than a run."""
+    if place is None:
+        return ()
+    settings = folder / "settings.toml"
+    settings.write_text("settle_cells_s = 0\nsettle_evidence_s = 0\n")
+    return "--objects", place, "--settings", str(settings)
+
+
+def _of_objects(postgres: PostgresServer, place: str) -> Iterator[str]:
+    """What is wrong where bytes are in an object store: damage, or that none moved since the restore."""
+    query = "SELECT count(*) FROM diff WHERE body IS NOT NULL"
+    until(lambda: postgres.execute(query, "cairn") == [(0,)], "all evidence moved to the object store again")
+    try:
+        serve(["check", "--store", postgres.url("cairn"), "--objects", place])
+    except DamagedDataError as exc:
+        yield exc.message
 
 
 def _here(command: str, backup: Path, *, time: str = "") -> str:

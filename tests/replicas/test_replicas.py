@@ -1,9 +1,10 @@
-"""Short runs of `tests.replicas`: faults of servers, of a link and of a disk, and the verdict on the store."""
+"""Short runs of `tests.replicas`: faults of servers, a link, a disk, an object store, and the verdict on the store."""
 
 from pathlib import Path
 
 import pytest
 from tests.fixtures.server.postgres import SYSTEM, WHEEL, programs_of
+from tests.replicas.cold_run import cold_run
 from tests.replicas.cut_link import cut_link_run
 from tests.replicas.fault_run import SILENCE_MAX_S, fault_run
 from tests.replicas.full_disk import full_disk_run
@@ -18,6 +19,13 @@ def test_nothing_that_was_acknowledged_is_lost_or_folded_twice(kind: str, seed: 
     assert found.verdict.is_sound and not found.pushed.wrong, said
     assert len(found.pushed.acked) > 50, said
     assert found.pushed.silence_s < SILENCE_MAX_S, said
+
+
+def test_nothing_is_lost_on_its_way_to_an_object_store_that_goes_away(tmp_path: Path) -> None:
+    found = cold_run(tmp_path, programs_of(WHEEL), seconds=9.0, robots=2, seed=2)
+    said = "\n".join(f"{what}: {value}" for what, value in found.rows())
+    assert found.is_sound, said
+    assert found.cold["cells"] and found.cold["segments"] and found.reads["200"] > 20, said
 
 
 def test_a_server_that_is_cut_off_from_the_database_says_so_and_works_again(tmp_path: Path) -> None:

@@ -118,7 +118,10 @@ class RobotReports:
                 noted.pop(key, None)
 
     def flush(self) -> None:
-        """Write the latest statuses, and note the latest pictures for other servers."""
+        """Write the latest statuses, and note the latest pictures and signs for other servers."""
+        if self._notes is not None:
+            # The last sign of a robot that fell silent waits for no further one.
+            self._notes.write_seen()
         with self._lock:
             statuses, views = list(self._unwritten), list(self._unshared)
         for key in statuses:

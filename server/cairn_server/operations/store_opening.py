@@ -1,5 +1,6 @@
 """Opening of the store that settings name: SQLite in a folder, or PostgreSQL with or without an object store behind."""
 
+import logging
 import secrets
 from collections.abc import Callable
 from contextlib import AbstractContextManager, closing, nullcontext
@@ -13,6 +14,8 @@ from cairn_server.store.sqlite.readers import Readers
 from cairn_server.store.sqlite.reads import SqliteReads
 from cairn_server.store.sqlite.store import FILE_NAME, SqliteStore
 from cairn_server.store.store import Store
+
+log = logging.getLogger(__name__)
 
 FOLD_CONNECTIONS = 4
 """Connections to the database of the process that plans folds: it has two threads."""
@@ -44,18 +47,27 @@ def store_of(settings: Settings) -> tuple[Callable[[], Store], Callable[[], Fold
     try:
         from cairn_server.store.objects.bucket import open_bucket
         from cairn_server.store.objects.read_ahead import ReadAhead
-        from cairn_server.store.settling.binding import bind
+        from cairn_server.store.settling.binding import bind, is_bound, try_bucket
     except ImportError as exc:
         raise _not_installed("--objects s3://...", "obstore", "objects") from exc
     place = settings.objects
 
     # A bucket has threads: each process opens its own, after it was forked.
     def open_store() -> Store:
-        bucket = open_bucket(place)
+        bucket, is_away = open_bucket(place), False
+        try:
+            try_bucket(bucket, place)
+        except BadInputError as exc:
+            # A store that is in it already goes on without it: what is not cold can be had, and robots can push.
+            is_away = bucket.failures > 0 and is_bound(url, place)
+            if not is_away:
+                raise
+            log.error("started without the object store, which does not answer: %s", exc.message)
         store = PgStore(url, objects=bucket, size_bytes_max=size_bytes_max)
         try:
             with closing(Connections(url, limit=1)) as connections:
-                bind(connections, bucket, place)
+                if not is_away:
+                    bind(connections, bucket, place)
         except BaseException:
             store.close()
             raise

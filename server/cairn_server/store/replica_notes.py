@@ -53,6 +53,10 @@ class NotedReport:
 class NotedReports(Protocol):
     """Reports of robots; of those that are not registered none is kept."""
 
+    def write_seen(self) -> None:
+        """Write soon what this server heard of branches and did not write yet (`store.Store.seen`)."""
+        ...
+
     def put_status(self, row: MapRow, branch: str, status: str, *, heard_s: float) -> None:
         """Keep the status of a branch, unless one that was heard later is kept.
 

@@ -8,6 +8,7 @@ import pytest
 from tests.fixtures.client.joined import ADMIN, Server, mapped, opened, settled
 from tests.fixtures.client.made import GEOMETRY, HEAD_BYTES, MAP, cells_of, large_commit, random_diff
 from tests.fixtures.server.live import until
+from tests.fixtures.server.stores import one_server
 from tests.links.proxy import Cut, Fault, FaultProxy
 
 from cairn_client.cli import relay as relay_command
@@ -93,6 +94,7 @@ def test_circles_are_harmless(base: Server, fields: list[Server], tmp_path: Path
     assert [len(server.ids()) for server in (base, *fields)] == [4, 4, 4]
 
 
+@one_server("one of them is given other settings")
 @pytest.mark.parametrize("at", [0, 1])
 def test_an_operator_s_retract_at_base_or_field_reaches_all_that_trust_the_server(
     tmp_path: Path, base: Server, fields: list[Server], at: int
@@ -139,6 +141,7 @@ def test_a_robot_takes_back_what_an_older_incarnation_of_it_said_on_every_server
     assert len(base.ids()) == 2
 
 
+@one_server("of two a mark of the relay counts two minutes later")
 def test_a_field_server_forgets_nothing_that_its_upstream_has_not_got(base: Server, tmp_path: Path) -> None:
     settings = {"keep_evidence_s": 0.0, "upstream": base.url}
     with Server(tmp_path / "field", **settings) as field:
@@ -288,6 +291,7 @@ def test_a_commit_that_comes_in_parts_is_signed_as_well(base: Server, fields: li
     assert base.ids() == {commit.id}
 
 
+@one_server("it counts connections, of which each request has its own before two")
 @pytest.mark.parametrize("cut", ["close", "half", "reset"])
 def test_a_commit_that_no_connection_carries_whole_goes_from_server_to_server_in_parts(
     base: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cut: Cut

@@ -10,6 +10,7 @@ from tests.fixtures.client.made import MAP, cells_of
 from tests.fixtures.client.robots import ADMIN, TOKEN, evidence_of, map_commit, robot_in
 from tests.fixtures.client.strangers import stranger
 from tests.fixtures.commands import cairn
+from tests.fixtures.server.stores import one_server
 
 from cairn_client.http.api import MapApi
 from cairn_client.robot.robot import Robot
@@ -54,6 +55,7 @@ def test_a_stranger_who_refuses_a_token_is_never_shown_the_enrolment_token(guard
         assert robot.sync().pushed == 1  # the token was good all the time
 
 
+@one_server("a token ends at the other one within a second")
 def test_a_robot_whose_token_was_ended_comes_back_by_an_operators_word_alone(
     guarded: LiveServer, admin: MapApi, tmp_path: Path
 ) -> None:
@@ -78,6 +80,7 @@ def test_a_robot_whose_token_was_ended_comes_back_by_an_operators_word_alone(
         assert refusal(robot).kind == "bad_token"  # the word was for one time
 
 
+@one_server("its own address is one of its names")
 def test_a_proof_that_another_server_hands_on_opens_nothing_and_one_under_a_public_name_does(
     guarded: LiveServer, admin: MapApi, tmp_path: Path
 ) -> None:

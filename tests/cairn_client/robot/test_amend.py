@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.fixtures.client.live_server import LiveServer
-from tests.fixtures.client.made import GEOMETRY, cells_of
+from tests.fixtures.client.made import GEOMETRY, PLAIN, cells_of
 from tests.fixtures.client.robot_program import INTEGRATOR, RIG, scan_of
 from tests.fixtures.client.world import stored_commits
 
@@ -19,8 +19,8 @@ from cairn_fusion.mapping.integrate import integrate_scan
 from cairn_fusion.recording.scan import Scan
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.ids import CommitId
+from cairn_map.epochs.history_map import HistoryMap
 from cairn_map.errors import BadInputError, ConflictError, DamagedDataError, NotFoundError
-from cairn_map.evidence.evidence_map import EvidenceMap
 
 NOWHERE = "http://127.0.0.1:9/maps/lab"
 PLENTY = 10_000_000
@@ -44,8 +44,8 @@ def moved(scan: Scan, T_map_rig: Transform) -> Scan:
     return dataclasses.replace(scan, T_map_rig=T_map_rig)
 
 
-def sum_of(scans: Sequence[Scan]) -> EvidenceMap:
-    total = EvidenceMap(GEOMETRY)
+def sum_of(scans: Sequence[Scan]) -> HistoryMap:
+    total = HistoryMap(PLAIN)
     for scan in scans:
         total.merge(integrate_scan(scan, RIG, GEOMETRY, integrator=INTEGRATOR))
     return total

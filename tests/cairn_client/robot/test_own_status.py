@@ -7,6 +7,7 @@ from tests.fixtures.client.live_server import LiveServer
 from tests.fixtures.client.made import MAP
 from tests.fixtures.client.robot_program import scan_of
 from tests.fixtures.client.robots import map_commit, robot_in
+from tests.fixtures.server.stores import one_server
 
 from cairn_client.cli.arguments import shown_age
 from cairn_client.cli.maps.branch_table import branch_table
@@ -21,6 +22,7 @@ def branch_of(server: LiveServer, name: str = "mole") -> BranchInfo:
         return next(branch for branch in api.branches(MAP) if branch.branch == name)
 
 
+@one_server("the other one knows where a robot stands a second later")
 def test_a_robot_tells_its_status_with_every_sync(server: LiveServer, tmp_path: Path) -> None:
     with robot_in(tmp_path, server.map_url) as mole:
         mole.status.battery, mole.status.note = 0.5, "in the yard"

@@ -9,7 +9,7 @@ from tests.fixtures.client.live_server import LiveServer
 from tests.fixtures.client.made import A, B, cells_of, flip_a_bit, seen
 from tests.fixtures.client.robots import evidence_of, map_commit, robot_in
 from tests.fixtures.client.team import Team
-from tests.fixtures.server.stores import KIND
+from tests.fixtures.server.stores import sqlite_of
 
 from cairn_client.cli.robots import replay as replay_command
 from cairn_client.http.api import MapApi
@@ -32,6 +32,7 @@ def team(server: LiveServer, tmp_path: Path) -> Iterator[Team]:
 
 def damage(server: LiveServer, key: CellKey, tables: tuple[str, ...] = ("cell", "diff")) -> None:
     """The disk flips a bit of a cell and of what it was made from, while the server is off."""
+    sqlite_of(server.service.store)
     server.stop()
     (database,) = server.settings.folder.glob("*.sqlite")
     for table in tables:
@@ -41,10 +42,9 @@ def damage(server: LiveServer, key: CellKey, tables: tuple[str, ...] = ("cell", 
 
 def change(server: LiveServer, statement: str) -> None:
     """The same for a whole column."""
+    sqlite_of(server.service.store)
     server.stop()
     (database,) = server.settings.folder.glob("*.sqlite")
-    if KIND != "sqlite":
-        pytest.skip("writes into SQLite's file")
     connection = sqlite3.connect(database)
     connection.execute(statement)
     connection.commit()

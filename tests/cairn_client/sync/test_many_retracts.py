@@ -7,6 +7,7 @@ from tests.fixtures.client.live_server import LiveServer
 from tests.fixtures.client.made import MAP, A, B, covering, cursor, exchanged, header, opened, seen
 from tests.fixtures.client.team import Team
 from tests.fixtures.server.crowded_map import add_commits, long_author
+from tests.fixtures.server.stores import sqlite_of
 
 from cairn_client.replica import replica as replicas
 from cairn_map.commits.ids import OPERATOR, Author, CommitId, Incarnation, RobotName
@@ -19,6 +20,7 @@ ROBOTS, AMENDS = 200, 400
 
 
 def test_a_round_still_works_after_a_whole_team_amended_all_it_measured(server: LiveServer, tmp_path: Path) -> None:
+    sqlite_of(server.service.store)
     server.stop()
     server.settings = server.settings.model_copy(update={"stable_after_s": 86_400})
     server.start()

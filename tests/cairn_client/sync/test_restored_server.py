@@ -7,6 +7,7 @@ import pytest
 from tests.fixtures.client.live_server import LiveServer
 from tests.fixtures.client.made import A, B, added, seen
 from tests.fixtures.client.team import Team
+from tests.fixtures.server.stores import sqlite_of
 
 from cairn_server.operations.serve import main
 
@@ -15,6 +16,7 @@ X, Y = seen(1, 2, kelvin_steps=7), seen(2, 100)
 
 @pytest.fixture
 def team(server: LiveServer, tmp_path: Path) -> Iterator[Team]:
+    sqlite_of(server.service.store)
     server.stop()
     server.settings = server.settings.model_copy(update={"stable_after_s": 86400})
     server.start()

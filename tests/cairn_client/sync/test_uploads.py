@@ -8,6 +8,7 @@ from random import Random
 import pytest
 from tests.fixtures.client.live_server import LiveServer
 from tests.fixtures.client.made import GEOMETRY, HEAD_BYTES, MAP, A, large_commit, opened, seen
+from tests.fixtures.server.stores import one_server
 from tests.links.proxy import Cut, Fault, FaultProxy
 
 from cairn_client.http.api import MapApi
@@ -46,6 +47,7 @@ def push(replica: Replica, link: FaultProxy, server: LiveServer, *, parts: Parts
             return broken
 
 
+@one_server("it counts connections, of which each request has its own before two")
 @pytest.mark.parametrize("cut", ["close", "half", "reset"])
 def test_a_commit_that_no_connection_can_carry_whole_arrives_and_is_paid_once(
     server: LiveServer, mole: Replica, cut: Cut
@@ -65,6 +67,7 @@ def test_a_commit_that_no_connection_can_carry_whole_arrives_and_is_paid_once(
         assert api.commit(MAP, commit.id)[0] == commit.data
 
 
+@one_server("it counts connections, of which each request has its own before two")
 def test_an_answer_that_is_lost_after_the_last_part_costs_one_question(server: LiveServer, mole: Replica) -> None:
     commit = large_commit(mole)
     parts = -(-len(commit.data) // PARTS.part_bytes)

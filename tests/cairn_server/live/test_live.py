@@ -17,6 +17,7 @@ from tests.fixtures.server.crowded_map import add_commits, long_author
 from tests.fixtures.server.listening import by_socket, by_sse, hello_of, socket_url, up_to_head
 from tests.fixtures.server.live import Live, until
 from tests.fixtures.server.pushes import MOLE, WREN, pushed
+from tests.fixtures.server.stores import one_server
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
@@ -129,6 +130,7 @@ def test_who_comes_back_hears_what_was_folded_meanwhile(live: Live, listen: List
     assert logged(found) == [str(COMMITS[1].id)]
 
 
+@one_server("ids of two do not fall, and may be equal")
 @pytest.mark.slow
 def test_who_comes_back_after_a_restart_goes_on_and_ids_still_rise(tmp_path: Path) -> None:
     with Live(tmp_path) as live:
@@ -284,6 +286,7 @@ def test_hello_lists_some_robots_and_events_of_their_own_tell_of_the_others(
     assert ticks == sorted(ticks)
 
 
+@one_server("of another one each tells the news of some seconds")
 @WAYS
 def test_robots_are_heard_of_when_they_come_push_fetch_and_leave(guarded: Live, listen: Listen) -> None:
     row = guarded.new_map()
@@ -453,6 +456,7 @@ def test_a_token_has_so_many_streams_and_gets_them_back(live: Live) -> None:
     assert live.service.live.listeners == 0
 
 
+@one_server("each has its own bound of streams")
 def test_all_tokens_together_have_so_many_streams(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("cairn_server.live.hub.LISTENERS_MAX", 1)
     row = live.new_map()
@@ -472,6 +476,7 @@ def test_who_goes_away_frees_its_place(live: Live, listen: Listen) -> None:
     until(lambda: live.service.live.listeners == 0, "nobody listens")
 
 
+@one_server("the other one goes on")
 def test_a_server_that_shuts_down_ends_its_streams(tmp_path: Path) -> None:
     with Live(tmp_path) as live:
         row = live.new_map()

@@ -10,6 +10,7 @@ from tests.fixtures.server.answers import kind_of
 from tests.fixtures.server.listening import by_socket, hello_of
 from tests.fixtures.server.live import Live, until
 from tests.fixtures.server.pushes import JPEG, MOLE, PNG, WREN, pushed
+from tests.fixtures.server.stores import one_server
 
 from cairn_map.wire.live_events import RobotHeard
 from cairn_map.wire.messages import RobotStatus
@@ -70,6 +71,7 @@ def test_the_last_status_is_in_the_list_and_told_to_listeners(live: Live) -> Non
     assert branch["last_seen_s"] > before_s
 
 
+@one_server("each writes for itself")
 def test_a_status_is_written_at_once_and_then_once_in_a_while(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
     row = live.new_map()
     register(live, row)
@@ -129,6 +131,7 @@ def test_who_is_not_registered_has_neither_status_nor_picture(live: Live) -> Non
         assert (answer.status_code, kind_of(answer)) == (404, "no_branch")
 
 
+@one_server("the other one shows it a second later")
 @pytest.mark.parametrize(("picture", "media_type"), [(JPEG, "image/jpeg"), (PNG, "image/png")])
 def test_a_picture_is_shown_until_the_next_one(live: Live, picture: bytes, media_type: str) -> None:
     row = live.new_map()
@@ -166,6 +169,7 @@ def test_a_picture_that_is_too_large_is_refused(live: Live) -> None:
     assert (answer.status_code, kind_of(answer)) == (413, "too_large")
 
 
+@one_server("each has its own bound")
 def test_all_pictures_together_stay_within_a_bound(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
     row = live.new_map()
     monkeypatch.setattr(robot_reports, "VIEWS_BYTES_MAX", 2 * len(JPEG))
@@ -239,6 +243,7 @@ def test_registering_again_keeps_the_row_and_a_new_incarnation_forgets_where_it_
     assert RobotStatus.model_validate(anew["status"]) == STATUS
 
 
+@one_server("each has its own pace")
 def test_a_flood_of_pictures_is_held_back_and_others_show_theirs(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
     row = live.new_map()
     register(live, row)

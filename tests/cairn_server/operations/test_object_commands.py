@@ -109,6 +109,13 @@ def test_a_cell_in_an_object_store_that_is_down_is_503(
     key = min(COMMITS[0].cells)
     answer = cell_of(other, key)
     assert (answer.status_code, kind_of(answer)) == (503, "objects_away")
+    # A server that is started meanwhile takes pushes, too: of a store that is in that bucket already.
+    third = served(tmp_path / "three", database, ended, *options, "--no-fold")
+    assert cell_of(third, key).status_code == 503
+    push(third, COMMITS[1])
+    assert "started without the object store" in ended[-1].said()
+    refused = Process(tmp_path / "four", "--store", new_database(database.server).url, *options)
+    assert refused.end()[0] == 1
     place.server.start()
     until(lambda: cell_of(other, key).status_code == 200, "the cell is back")
 
@@ -128,6 +135,8 @@ def test_a_place_that_will_not_do_is_refused_with_the_next_step(
     monkeypatch.setenv("AWS_ACCESS_KEY_ID", READER)
     assert "cannot write" in refusal(*store, "--objects", place.url)
     assert not place.names()
+    tables = "SELECT count(*) FROM pg_class WHERE relnamespace = 'public'::regnamespace"
+    assert database.execute(tables) == [(0,)]  # nothing is made for a bucket that will not do
     with pytest.raises(BadInputError, match="--objects: expected a URL"):
         main(["check", "--store", database.url, "--objects", "x"])
 

@@ -1,8 +1,10 @@
-"""Plans of the queries in PostgreSQL: none reads through a table that grows with the map.
+"""What the store asks of PostgreSQL: no query reads through a table that grows with the map, no key spans maps.
 
-They are asked for few rows each: for many of them PostgreSQL may rightly read through a table of this size.
+Queries are asked for few rows each: for many of them PostgreSQL may rightly read through a table of this size. Nothing
+is used that databases which only speak its language lack, so that maps can be spread over several one day.
 """
 
+import ast
 import json
 import math
 import re
@@ -23,6 +25,7 @@ from cairn_map.evidence.grid import Cell, cell_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.service import Service
 from cairn_server.settings import Settings
+from cairn_server.store import postgres, settling
 from cairn_server.store.postgres import connections, health, reads, retention, snapshot, tile_rows
 from cairn_server.store.postgres.connections import Connection
 from cairn_server.store.postgres.snapshot import PgSnapshot
@@ -165,3 +168,66 @@ def test_idle_maps_cost_probes_and_metrics_no_statement(
     assert statements() == before < 20
     monkeypatch.setattr(store, "close", lambda: None)  # by the fixture
     service.close()
+
+
+OF_THE_STORE = {"map", "token", "dead_object_since"}
+"""Tables and an index whose keys find a map, or what is due in any: those of a directory, were maps spread."""
+KEYS_OF_TABLES = """
+    SELECT table_.relname, index_.relname,
+        array(SELECT attname FROM unnest(i.indkey::int2[]) WITH ORDINALITY AS k (n, place)
+            JOIN pg_attribute ON attrelid = i.indrelid AND attnum = k.n ORDER BY place)::text
+    FROM pg_index AS i JOIN pg_class AS table_ ON table_.oid = indrelid
+        JOIN pg_class AS index_ ON index_.oid = indexrelid
+    WHERE table_.relnamespace = 'public'::regnamespace AND EXISTS (
+        SELECT FROM pg_attribute WHERE attrelid = table_.oid AND attname = 'map' AND NOT attisdropped)
+"""
+STATEMENT = re.compile(r"\b(SELECT|INSERT|UPDATE|DELETE|CREATE|ALTER|LOCK|DROP)\b")
+FOREIGN_TO_MANY = re.compile(
+    r"advisory|SKIP LOCKED|nextval|currval|lastval|setval|\bSERIAL\b|\bREFERENCES\b|CREATE\s+(OR REPLACE\s+)?"
+    r"(TRIGGER|FUNCTION|PROCEDURE|EXTENSION|RULE)|\blo_(import|create|put|get)",
+    re.IGNORECASE,
+)
+"""What is in no statement: locks that no row has, sequences that are read, and what is the database's program."""
+
+
+def test_every_key_begins_with_the_map_and_those_of_cells_have_room_for_a_layer(
+    postgres_database: Database,
+) -> None:
+    PgStore(postgres_database.url).close()
+    rows = postgres_database.execute(KEYS_OF_TABLES)
+    found = [(str(table), str(index), re.findall(r"\w+", str(columns))) for table, index, columns in rows]
+    tables = {table for table, *_ in found}
+    assert {"commits", "log", "cell", "diff", "touched", "tile", "head", "author", "lease"} <= tables
+    for table, index, columns in found:
+        if not {table, index} & OF_THE_STORE:
+            assert columns[0] == "map", (index, columns)
+        if {"cell", "tile"} & set(columns) and table != "settled":
+            assert "layer" in columns, (index, columns)
+
+
+def test_the_database_has_no_program_of_its_own_and_no_key_across_tables(postgres_database: Database) -> None:
+    of_public = "pronamespace = 'public'::regnamespace"
+    PgStore(postgres_database.url).close()
+    for query in (
+        "SELECT tgname FROM pg_trigger WHERE NOT tgisinternal",
+        f"SELECT proname FROM pg_proc WHERE {of_public}",
+        "SELECT conname FROM pg_constraint WHERE contype = 'f'",
+        "SELECT relname FROM pg_class WHERE relkind = 'S' AND relname NOT IN ('map_map_seq', 'commits_number_seq')",
+    ):
+        assert postgres_database.execute(query) == []
+
+
+def test_no_statement_takes_what_other_databases_of_this_language_lack() -> None:
+    rooms = [Path(postgres.__file__).parent, Path(settling.__file__).parent]
+    texts = [
+        (path.name, str(node.value))
+        for room in rooms
+        for path in sorted(room.glob("*.py"))
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and STATEMENT.search(node.value)
+    ]
+    assert len(texts) > 100
+    assert [(name, text) for name, text in texts if FOREIGN_TO_MANY.search(text)] == []
+    # One connection of its own listens, which is never lent to anybody else.
+    listening = [name for room in rooms for name in room.glob("*.py") if re.search(r"LISTEN \{", name.read_text())]
+    assert [path.name for path in listening] == ["replica_notes.py"]

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from tests.fixtures.map.made import SMALL
 from tests.fixtures.server.commit_contract import bodies, folded_map, new_map
 from tests.fixtures.server.crowd_contract import all_at_once
+from tests.fixtures.server.evidence_contract import fold
 from tests.fixtures.server.live import until
 from tests.fixtures.server.postgres import Database, PostgresServer, new_database
 from tests.fixtures.server.pushes import KEYS, MOLE, WREN, pushed, read, sum_of
@@ -27,6 +28,8 @@ from cairn_map.errors import ConflictError, NotFoundError, UnreachableError
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.folding.cell_cache import CellCache
 from cairn_server.folding.folding import fold_pending
+from cairn_server.live.hub import Hub
+from cairn_server.live.robot_reports import RobotReports
 from cairn_server.store import history
 from cairn_server.store.postgres import replica_notes as postgres_notes
 from cairn_server.store.postgres import tokens as postgres_tokens
@@ -34,7 +37,7 @@ from cairn_server.store.postgres.connections import Connections
 from cairn_server.store.postgres.folds import CHANNEL
 from cairn_server.store.postgres.store import PgStore
 from cairn_server.store.replica_notes import BodyPart, BodyPlace, FoldHint, FoldHints, UseAnswer, UseBounds
-from cairn_server.store.store_rows import MapRow, Use
+from cairn_server.store.store_rows import Branch, MapRow, Use
 
 pytestmark = [pytest.mark.processes, pytest.mark.slow]
 
@@ -188,6 +191,30 @@ def test_lines_of_two_servers_are_one_chain_of_which_the_newest_are_kept(
     assert all(line.is_next_after(before) for before, line in pairwise(lines))
 
 
+def test_lines_that_come_while_another_server_writes_its_own_are_written_at_once(
+    store: PgStore, postgres_database: Database
+) -> None:
+    store.audit("test", "the row of the chain's end is there")
+    details = [f"robot {n}" for n in range(6)]
+    threads = [threading.Thread(target=partial(store.audit_log.add, "chief", "register", each)) for each in details]
+    with locked(postgres_database, "SELECT FROM audit_head"):
+        for thread in threads:
+            thread.start()
+        until(lambda: len(store.audit_log._waiting) == 5, "one is being written, and all others wait for it")
+    for thread in threads:
+        thread.join()
+    assert {line.detail for line in store.audit_log.page(after=1, limit=9)} == set(details)
+    ((transactions,),) = postgres_database.execute("SELECT count(DISTINCT xmin::text) FROM audit WHERE number > 1")
+    assert transactions == 2
+
+
+def test_a_line_that_cannot_be_written_fails_alone(store: PgStore) -> None:
+    with pytest.raises(UnicodeEncodeError):
+        store.audit_log.add("chief", "register", "\ud800")
+    store.audit_log.add("chief", "register", "the next one")
+    assert [line.detail for line in store.audit_log.page(after=0, limit=9)] == ["the next one"]
+
+
 def test_servers_together_take_no_more_use_than_one_may(store: PgStore, other: PgStore) -> None:
     robot, bounds = (new_map(store).number, "mole"), UseBounds(size_bytes=100, commits_per_minute=12)
     taken: list[UseAnswer] = []
@@ -212,6 +239,25 @@ def test_first_parts_that_come_to_two_servers_at_once_are_one_body(store: PgStor
         place = BodyPlace(number, "mole", pushed(n, 0).id)
         all_at_once([partial(append, store, place), partial(append, other, place)])
         assert store.replicas.bodies.body(place, "a" * 64) == b"abcde"
+
+
+def test_the_last_sign_of_a_robot_that_fell_silent_reaches_other_servers(store: PgStore, other: PgStore) -> None:
+    row = new_map(store)
+    store.register(row, Branch("mole", "high-end", (), None, 5.0, MOLE.incarnation), b"m" * 32)
+    with store.snapshot(row) as snapshot:
+        before = snapshot.head
+    store.seen(row, "mole", before)
+    fold(store, row, pushed(0, 0))
+    with store.snapshot(row) as snapshot:
+        store.seen(row, "mole", snapshot.head)  # a moment later, which is not written at once
+    reports = RobotReports(store, Hub(store, connections=9))
+    reports.flush()  # as each second, by the watch
+
+    def is_told() -> bool:
+        found = other.branch(row, "mole")
+        return found is not None and found.cursor is not None and found.cursor.seq == before.seq + 1
+
+    until(is_told, "it is written")
 
 
 def test_servers_have_one_secret(store: PgStore, other: PgStore) -> None:

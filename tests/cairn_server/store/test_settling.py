@@ -9,6 +9,7 @@ import pytest
 from tests.fixtures.map.made import SMALL, random_evidence
 from tests.fixtures.server.commit_contract import folded_map
 from tests.fixtures.server.crowd_contract import all_at_once
+from tests.fixtures.server.deadline import until
 from tests.fixtures.server.evidence_contract import SOON, cells_of, fold, kept_bytes
 from tests.fixtures.server.object_store import READER, ObjectPlace
 from tests.fixtures.server.postgres import Database, PostgresServer, new_database
@@ -503,3 +504,31 @@ def test_pushes_are_refused_before_the_database_is_full(database: Database, capl
         with pytest.raises(UnreachableError) as caught:
             store.health.check_space(1)
         assert caught.value.kind == "disk_full"
+
+
+LARGE = """
+    INSERT INTO diff (map, commit_number, cell, body)
+    SELECT 1, n, 1, (SELECT string_agg(sha256(k::text::bytea), '') FROM generate_series(1, 8192) AS k)
+    FROM generate_series({first}, {last}) AS n"""
+"""SQL of evidence of 256 kB each."""
+
+
+def test_room_that_moved_bytes_left_behind_is_room_again(database: Database) -> None:
+    PgStore(database.url).close()
+    ((size_bytes,),) = database.execute("SELECT pg_database_size(current_database())")
+    room = int(str(size_bytes)) + (16 << 20)
+    with closing(PgStore(database.url, size_bytes_max=room)) as store:
+        database.execute(LARGE.format(first=1, last=64))
+        with pytest.raises(UnreachableError, match=r"of .* MB"):
+            store.health.check_space(1)
+    # The last one stays, so that the file does.
+    database.execute("UPDATE diff SET body = NULL, segment = 'segments/1' WHERE commit_number < 64")
+    database.execute("VACUUM diff")
+    with closing(PgStore(database.url, size_bytes_max=room)) as store:
+        store.health.check_space(1)
+        free = store.health.figures().free_bytes
+        assert free is not None
+        assert free > 12 << 20
+        # What comes takes that room, as is known a second later.
+        database.execute(LARGE.format(first=65, last=88))
+        until(lambda: (store.health.figures().free_bytes or 0) < free - (5 << 20), "it is counted")

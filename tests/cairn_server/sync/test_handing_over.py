@@ -10,6 +10,7 @@ from tests.fixtures.server.answers import kind_of
 from tests.fixtures.server.live import Live
 from tests.fixtures.server.pushes import pushed, read, sum_of
 from tests.fixtures.server.signatures import FRIEND, KEYS, MOLE, OLD_MOLE, WREN, signed
+from tests.fixtures.server.stores import one_server
 from tests.fixtures.server.uploads import add, state
 
 from cairn_map.commits.commit import Commit, renamed_commit
@@ -184,6 +185,7 @@ def test_a_bad_signature_on_an_own_commit_is_refused_too(live: Live, row: MapRow
     assert kind_of(live.push(row, commit, headers=headers)) == "bad_signature"
 
 
+@one_server("those that ask to be admitted are known to the one that refused them")
 def test_a_name_that_is_known_is_not_a_relay_s_to_speak_in_under_another_key(live: Live, row: MapRow) -> None:
     body = {"robot": "mole", "incarnation": MOLE.incarnation}
     live.http.post(f"/maps/{row.name}/branches", json=body, headers=bearer(ADMIN)).raise_for_status()

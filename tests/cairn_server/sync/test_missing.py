@@ -9,6 +9,7 @@ from tests.fixtures.server.answers import kind_of
 from tests.fixtures.server.fetching import ask_missing, fetch
 from tests.fixtures.server.live import Live
 from tests.fixtures.server.pushes import KEYS, MOLE, WREN, pushed, read, sum_of
+from tests.fixtures.server.stores import one_server
 from tests.naive.asker import KEY_FAR, NaiveAsker, cell_frames, fingerprint_sum
 
 from cairn_map.commits.cursor import Cursor, cursor_from_text
@@ -272,6 +273,7 @@ def test_many_entries_are_not_even_tried_as_a_delta(live: Live, monkeypatch: pyt
     assert {frame.kind for frame in found.values()} == {FrameKind.FULL}
 
 
+@one_server("the name of its operator is its own")
 def test_the_header_tells_what_a_robot_may_conclude(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
     row = live.new_map()
     commits = [pushed(n, n) for n in (0, 1)]

@@ -9,6 +9,7 @@ from tests.fixtures.map.stored import recoded
 from tests.fixtures.server.answers import kind_of
 from tests.fixtures.server.live import Live
 from tests.fixtures.server.pushes import KEYS, MOLE, WREN, pushed, read, sum_of
+from tests.fixtures.server.stores import one_server
 
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.ids import INITIAL, Author, Incarnation, RobotName
@@ -168,6 +169,7 @@ def test_a_robot_s_share_of_a_cell_takes_no_more_than_fits(live: Live, monkeypat
     assert kind_of(live.push(row, again[1])) == "evidence_overflow"
 
 
+@one_server("it writes a row now and then, and so does the other one")
 def test_a_busy_robot_s_row_is_written_now_and_then_only(live: Live) -> None:
     row = live.new_map()
     body = {"robot": "mole", "incarnation": MOLE.incarnation}

@@ -25,6 +25,20 @@ PROBE_S = 5
 MAPS_MAX = 1000
 """Most maps whose backlogs are listed."""
 SIZE = "SELECT pg_database_size(current_database())"
+CHUNK_BYTES = 2048
+"""Part of a page that a chunk of a long value takes: four are on a page of 8 kB."""
+USED = f"""
+SELECT pg_database_size(current_database()) - coalesce((
+    SELECT sum(greatest(0, pg_relation_size(long.oid) - (long.reltuples + stat.n_ins_since_vacuum) * {CHUNK_BYTES}))
+    FROM pg_class AS own JOIN pg_class AS long ON long.oid = own.reltoastrelid
+        JOIN pg_stat_all_tables AS stat ON stat.relid = long.oid
+    WHERE own.oid IN ('cell'::regclass, 'diff'::regclass) AND long.reltuples >= 0
+), 0)::bigint"""
+"""SQL of the database's size less what bytes of cells and evidence left behind that went, to an object store mostly.
+
+Files of PostgreSQL do not shrink: a row that goes makes room for others in them once VACUUM has seen it. Without this
+a database that was full once would be full for ever.
+"""
 SIZE_EVERY_S = 5.0
 """Time between two looks at the database's size: pushes ask for it."""
 ALARM_SHARE, FULL_SHARE = 0.7, 0.95
@@ -34,7 +48,7 @@ log = logging.getLogger(__name__)
 
 
 class _Size(NamedTuple):
-    """Size of the database at an instant."""
+    """Room that the database takes at an instant."""
 
     size_bytes: int
     at_s: float
@@ -99,13 +113,13 @@ class PgHealth:
     def figures(self) -> StoreFigures:
         """Sizes and counts."""
         with self._connections.lent() as connection:
-            size_bytes = first(connection, SIZE)
+            size_bytes, used = first(connection, SIZE), first(connection, USED)
             sums = "SELECT coalesce(sum(cells_bytes), 0)::bigint, coalesce(sum(history_bytes), 0)::bigint FROM head"
             cells_bytes, history_bytes = first(connection, sums)
         return StoreFigures(
             size_bytes=size_bytes,
             ahead_bytes=0,
-            free_bytes=None if self._size_bytes_max is None else max(0, self._size_bytes_max - size_bytes),
+            free_bytes=None if self._size_bytes_max is None else max(0, self._size_bytes_max - used),
             queued=self._threads.queued,
             written=self._connections.written,
             emptied=0,
@@ -128,7 +142,7 @@ class PgHealth:
             return
         if self._steady_s() - self._size.at_s > SIZE_EVERY_S:
             with self._connections.lent() as connection:
-                self._size = _Size(first(connection, SIZE), self._steady_s())
+                self._size = _Size(first(connection, USED), self._steady_s())
         used, text = self._size.size_bytes, f"{self._size.size_bytes >> 20} of {room >> 20} MB"
         is_alarmed = used > ALARM_SHARE * room
         if is_alarmed and not self._is_alarmed:

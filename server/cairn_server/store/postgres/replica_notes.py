@@ -98,6 +98,10 @@ class PgReports:
         self._noting = noting
         self._branches = branches
 
+    def write_seen(self) -> None:
+        """Write soon what was heard of branches."""
+        self._branches.write_seen()
+
     def put_status(self, row: MapRow, branch: str, status: str, *, heard_s: float) -> None:
         """Keep a status, unless a later one is kept."""
         self._branches.put_heard_status(row, branch, status, heard_s=heard_s)

@@ -3,6 +3,8 @@
 import logging
 import threading
 import time
+from concurrent.futures import Future
+from dataclasses import dataclass, field
 
 from cairn_map.errors import ConflictError
 from cairn_map.wire.access_messages import AuditEntry, audit_chain
@@ -127,16 +129,65 @@ class PgTokens:
         return token
 
 
+@dataclass(frozen=True, slots=True)
+class _WaitingLine:
+    """A line of the audit log, and that it is durable."""
+
+    who: str
+    what: str
+    detail: str
+    written: "Future[None]" = field(default_factory=Future)
+
+    def __post_init__(self) -> None:
+        """Refuse a text that the database cannot hold, before it is written together with others' lines.
+
+        Raises:
+            UnicodeEncodeError: half of a surrogate pair.
+        """
+        f"{self.who}{self.what}{self.detail}".encode()
+
+
 class PgAuditLog:
-    """`store.AuditLog`."""
+    """`store.AuditLog`: one chain for all servers of the store, so one of them adds to it at a time.
+
+    Lines that come to a server while it waits for its turn, as of robots that all register after an outage, are written
+    by one transaction: they wait for one flush of the database's disk and not each for its own.
+    """
 
     def __init__(self, connections: Connections) -> None:
         self._connections = connections
+        self._lock = threading.Lock()
+        self._turn = threading.Lock()
+        self._waiting: list[_WaitingLine] = []
 
     def add(self, who: str, what: str, detail: str) -> None:
         """One more line; durable on return."""
         log.info("%s: %s: %r", who, what, detail)
-        self._connections.run(lambda connection: write_audit(connection, SERVER_STREAM, who, what, detail))
+        line = _WaitingLine(who, what, detail)
+        with self._lock:
+            self._waiting.append(line)
+        with self._turn:
+            if not line.written.done():
+                self._write_waiting()
+        line.written.result()
+
+    def _write_waiting(self) -> None:
+        """Write all lines that wait, in the order in which they came."""
+        with self._lock:
+            lines, self._waiting = self._waiting, []
+
+        def job(connection: Connection) -> None:
+            for line in lines:
+                write_audit(connection, SERVER_STREAM, line.who, line.what, line.detail)
+
+        try:
+            self._connections.run(job)
+        except BaseException as exc:
+            for line in lines:
+                line.written.set_exception(exc)
+            raise
+        for line in lines:
+            line.written.set_result(None)
 
     def page(self, *, after: int, limit: int) -> list[AuditEntry]:
         """Lines numbered above `after`, oldest first."""

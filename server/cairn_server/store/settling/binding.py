@@ -5,7 +5,7 @@ All copies of a database have its id; which of them may write there is the matte
 """
 
 import secrets
-from contextlib import suppress
+from contextlib import closing, suppress
 
 from cairn_map.errors import BadInputError
 from cairn_server.store.objects.bucket import Bucket
@@ -16,14 +16,33 @@ from cairn_server.store.postgres.schema import BOUND_OLDEST
 PROBE = b"cairn"
 
 
-def bind(connections: Connections, bucket: Bucket, url: str) -> None:
-    """Bind a database to a bucket, or find them bound; the bucket is tried first.
+def try_bucket(bucket: Bucket, url: str) -> None:
+    """Write, read, list and delete an object, before anything is made in a database for it.
 
     Raises:
-        BadInputError: kind `bad_objects`: it cannot be reached, written, read or deleted from, or is another store's.
-        CairnError: the database does not answer.
+        BadInputError: kind `bad_objects`: the bucket cannot be reached, written, read, listed or deleted from.
     """
-    _try(bucket, url)
+    name = f"probes/{secrets.token_hex(8)}"
+    try:
+        bucket.put(name, PROBE)
+        if bucket.part(name, start=1, size_bytes=len(PROBE) - 1) != PROBE[1:]:
+            raise AwayError(f"what was written as {name} cannot be read")
+        if not any(name in page for page in bucket.names("probes")):
+            raise AwayError(f"what was written as {name} is not listed")
+        bucket.delete(name)
+    except AwayError as exc:
+        with suppress(AwayError):
+            bucket.delete(name)
+        raise _bad(url, exc.message) from exc
+
+
+def bind(connections: Connections, bucket: Bucket, url: str) -> None:
+    """Bind a database to a bucket that was tried (`try_bucket`), or find them bound.
+
+    Raises:
+        BadInputError: kind `bad_objects`: it is another store's.
+        CairnError: the database or the bucket does not answer.
+    """
     with connections.lent() as connection:
         known = first(connection, "SELECT id FROM object_store")
         # A settler claims before it makes its first object.
@@ -41,32 +60,24 @@ def bind(connections: Connections, bucket: Bucket, url: str) -> None:
             connection.execute("UPDATE object_store SET url = %s WHERE url <> %s", (url, url))
 
 
+def is_bound(store_url: str, url: str) -> bool:
+    """True if a database, which may have no tables yet, has its bytes in the bucket of this URL.
+
+    Raises:
+        CairnError: the database does not answer.
+    """
+    with closing(Connections(store_url, limit=1)) as connections, connections.lent() as connection:
+        if not first(connection, "SELECT to_regclass('object_store') IS NOT NULL"):
+            return False
+        return bool(first(connection, "SELECT url FROM object_store") == url)
+
+
 def _note(connection: Connection, url: str) -> str:
     """Note the bond; its id, which another server may have drawn."""
     connection.execute("UPDATE cairn_schema SET oldest = greatest(oldest, %s)", (BOUND_OLDEST,))
     query = "INSERT INTO object_store (one, id, url) VALUES (true, %s, %s) ON CONFLICT (one) DO NOTHING"
     connection.execute(query, (secrets.token_hex(16), url))
     return str(first(connection, "SELECT id FROM object_store"))
-
-
-def _try(bucket: Bucket, url: str) -> None:
-    """Write, read, list and delete an object.
-
-    Raises:
-        BadInputError: kind `bad_objects`.
-    """
-    name = f"probes/{secrets.token_hex(8)}"
-    try:
-        bucket.put(name, PROBE)
-        if bucket.part(name, start=1, size_bytes=len(PROBE) - 1) != PROBE[1:]:
-            raise AwayError(f"what was written as {name} cannot be read")
-        if not any(name in page for page in bucket.names("probes")):
-            raise AwayError(f"what was written as {name} is not listed")
-        bucket.delete(name)
-    except AwayError as exc:
-        with suppress(AwayError):
-            bucket.delete(name)
-        raise _bad(url, exc.message) from exc
 
 
 def _bad(url: str, why: str) -> BadInputError:
