@@ -184,7 +184,7 @@ def _is_likely(
 ) -> npt.NDArray[np.bool_]:
     """(N,) True where the observations after some epoch, not before `since`, differ from all until then.
 
-    What changed long after `since` was first seen as before: against these observations, too, the new ones count.
+    What changed long after `since` was first seen unchanged: against these observations, too, the new ones count.
 
     Args:
         history: the cell's.
