@@ -34,6 +34,8 @@ from cairn_map.errors import BadInputError, DamagedDataError
 from cairn_map.evidence.grid import CELL_LIMIT, CellKey, Geometry, cell_key, cell_of_key
 
 VERSION = 2
+FLAG_EVICTS = 1
+"""Flag that is reserved for cells of maps that let old rows go, with fields of their own."""
 FIXED_PART = struct.Struct("<4sBBBBIiiiIIBB")
 ROW_HEAD = struct.Struct("<qIIBBI")
 
@@ -202,6 +204,8 @@ def _decode_head(data: bytes) -> tuple[CellKey, MapLayer, int, int]:
     _, version, kind, depth, flags, edge_um, i, j, k, epoch_s, rows, channels, name_bytes = FIXED_PART.unpack_from(data)
     if version != VERSION or kind != KIND_EVIDENCE:
         raise BadInputError("unknown_version", f"expected a cell of version 2, kind 1; got {version}, {kind}")
+    if flags & FLAG_EVICTS:
+        raise BadInputError("unknown_version", "this reader knows no cells of maps that let old rows go")
     if flags or not all(-CELL_LIMIT <= v < CELL_LIMIT for v in (i, j, k)):
         raise DamagedDataError("bad_cell", "unknown flags, or a cell number out of range")
     at = FIXED_PART.size + name_bytes

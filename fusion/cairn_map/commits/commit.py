@@ -32,6 +32,8 @@ from cairn_map.evidence.grid import CellKey, Geometry
 MAGIC = b"CRCM"
 SUM_VERSION, EPOCH_VERSION = 1, 2
 """Versions of a commit's bytes: of maps with one sum for all times, and of maps with epochs."""
+EVICTION_FIELDS = frozenset({"keep_epochs", "weight_max"})
+"""Fields of a layer that are reserved for maps that let old rows go."""
 LAYERS_MAX = 1
 """Layers of a commit that this reader knows; the format has room for 16."""
 CELL_PREFIX = {SUM_VERSION: struct.Struct("<I"), EPOCH_VERSION: struct.Struct("<BI")}
@@ -324,6 +326,8 @@ def split_bytes(data: bytes) -> tuple[CommitMeta, bytes, list[bytes]]:
         # Readers differ in which of two equal keys they take, and the SHA-256 is the same for all of them.
         _UNIQUE.decode(text.decode())
     except ValidationError as exc:
+        if any(set(error["loc"]) & EVICTION_FIELDS for error in exc.errors(include_url=False, include_input=False)):
+            raise BadInputError("unknown_version", "this reader knows no layers that let old rows go") from None
         raise DamagedDataError("bad_commit", f"commit meta: {first_error(exc)}") from None
     if meta.version != version:
         raise DamagedDataError("bad_commit", f"a commit of version {version} has the meta of version {meta.version}")

@@ -122,7 +122,7 @@ def _with_row(*fields: int) -> bytes:
         _with_row(BASE, 0, 0, *ROW_HEAD.unpack_from(CELL, HEAD_BYTES)[3:]),
         _with_row(BASE, 600, 600, *ROW_HEAD.unpack_from(CELL, HEAD_BYTES)[3:]),
         _with_row(BASE, *ROW_HEAD.unpack_from(CELL, HEAD_BYTES)[1:3], 2, *ROW_HEAD.unpack_from(CELL, HEAD_BYTES)[4:]),
-        CELL[:7] + b"\1" + CELL[8:],
+        CELL[:7] + b"\2" + CELL[8:],
     ],
     ids=["left over", "epoch 2^62", "epoch -2^62", "out of order", "empty", "too many voxels", "row flag", "head flag"],
 )
@@ -160,3 +160,11 @@ def test_all_rows_share_one_bound_of_memory() -> None:
     with pytest.raises(BadInputError) as caught:
         decode_history(encode_history(KEY, two, LAYER).data, evidence_bytes_max=bound)
     assert caught.value.kind == "too_large"
+
+
+def test_what_is_reserved_for_maps_that_let_old_rows_go_is_of_an_unknown_version() -> None:
+    data = bytearray(encode_history(KEY, random_history(1), LAYER).data)
+    data[7] |= 1
+    with pytest.raises(BadInputError) as caught:
+        split_history(bytes(data))
+    assert caught.value.kind == "unknown_version"

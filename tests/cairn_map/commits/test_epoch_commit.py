@@ -134,3 +134,13 @@ def test_commits_are_of_few_bytes_more_than_without_epochs() -> None:
     )
     timed = make_commit(epoch_meta(), {KEY: random_evidence(0, SMALL)}, LAYER)
     assert len(timed.data) < len(plain.data) + 64
+
+
+@pytest.mark.parametrize("field", ["keep_epochs", "weight_max"])
+def test_a_layer_that_lets_old_rows_go_is_of_an_unknown_version(field: str) -> None:
+    commit = epoch_commit()
+    text = commit.text.replace(b'"epoch_s":120', f'"epoch_s":120,"{field}":30'.encode())
+    data = bytes_of(text, commit.cells, version=2)
+    with pytest.raises(BadInputError) as caught:
+        split_commit(data)
+    assert caught.value.kind == "unknown_version"
