@@ -1,6 +1,6 @@
 """Conversations of `sync.requests` held over HTTP: each request is sent, and its answer handed back."""
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from typing import Any, TypeVar
 
 from cairn_client.http.api import MapApi
@@ -37,7 +37,9 @@ T = TypeVar("T")
 class Link:
     """HTTP link of one robot to one map: it holds conversations."""
 
-    def __init__(self, api: MapApi, map_name: str, *, branch: str, has_epochs: bool = True) -> None:
+    def __init__(
+        self, api: MapApi, map_name: str, *, branch: str, has_epochs: Callable[[], bool] = lambda: True
+    ) -> None:
         self._api = api
         self._has_epochs = has_epochs
         self._map_name = map_name
@@ -69,7 +71,7 @@ class Link:
             case GetMissing(request):
                 self._stop_reading()
                 self._frames = api.missing(
-                    name, self._branch, request, replies=self._replies, has_epochs=self._has_epochs
+                    name, self._branch, request, replies=self._replies, has_epochs=self._has_epochs()
                 )
                 return next(self._frames, None)
             case NextFrame():

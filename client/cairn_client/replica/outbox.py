@@ -148,6 +148,10 @@ class Outbox:
         for kept in self._store.commits():
             self._note(kept)
 
+    def take_layer(self, layer: MapLayer) -> None:
+        """Make commits of this layer from here on."""
+        self._layer = layer
+
     def __iter__(self) -> Iterator[KeptCommit]:
         """Commits whose bytes are kept, oldest first."""
         return (kept for kept in self._commits.values() if kept.has_data)

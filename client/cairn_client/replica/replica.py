@@ -137,16 +137,37 @@ class Replica:
         self.state = ReplicaState(store)
         self.layer = MapLayer(geometry=geometry, epoch_s=epoch_s)
         self._keep_acked_s = keep_acked_s
+        self._memory_bytes_max = memory_bytes_max
         self.state.identify(robot=robot, map_name=map_name, layer=self.layer)
         self._budget: StorageBudget | None = None
         self.outbox = Outbox(self.state, robot, self.layer, make_room=self._make_room, amendable=amendable)
-        self._base = ServerCells(
-            self.state, self.outbox, self.layer, admit=self._admit, memory_bytes_max=memory_bytes_max
-        )
+        self._base = self._opened_base()
         self.header: ReplyHeader | None = self.state.header
         """Newest state that the server reported."""
         self.refusals = RefusedPushes()
         self._snapshot: MapSnapshot | None = None
+
+    def _opened_base(self) -> ServerCells:
+        return ServerCells(
+            self.state, self.outbox, self.layer, admit=self._admit, memory_bytes_max=self._memory_bytes_max
+        )
+
+    def take_epochs(self, layer: MapLayer) -> None:
+        """Go on as a robot of a map with epochs, of the same grid, which no server had told it before.
+
+        Its commits until now state no epoch: they are of the base there, as those of any robot that never learnt the
+        server's time.
+
+        Raises:
+            BadInputError: kind `other_replica`: another grid, or it holds something of a server's map.
+        """
+        with self._lock:
+            if self.header is not None or self.layer.has_epochs or layer.geometry != self.geometry:
+                raise BadInputError("other_replica", f"the robot's folder is of a map with {self.layer}, not {layer}")
+            self.state.epoch_s = layer.epoch_s
+            self.layer = layer
+            self.outbox.take_layer(layer)
+            self._base, self._snapshot = self._opened_base(), None
 
     @contextmanager
     def changing(self) -> Iterator[ServerCells]:

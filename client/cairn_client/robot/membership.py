@@ -155,10 +155,15 @@ class Membership:
         return Register(robot=author.robot, mode=self._mode, incarnation=author.incarnation, sensors=self._sensors)
 
     def _keep(self, registered: Registered) -> None:
-        if registered.map.layer != self._replica.layer:
+        layer = registered.map.layer
+        here, is_fresh = self._replica.layer, self._replica.header is None
+        if is_fresh and layer.has_epochs and not here.has_epochs and layer.geometry == here.geometry:
+            # A robot that began without a link could not know of the map's epochs.
+            self._replica.take_epochs(layer)
+        if layer != self._replica.layer:
             raise BadInputError(
                 "other_geometry",
-                f"map {self._map_name} has {registered.map.layer}; this robot's directory has "
+                f"map {self._map_name} has {layer}; this robot's directory has "
                 f"{self._replica.layer}. Its {len(self._replica.push_set())} waiting commits stay there: push them "
                 "to a map with their grid, and give the robot another directory for this map",
             )

@@ -143,7 +143,7 @@ class Rounds:
         self._clock = clock
         self._carrier = carrier
         self._branch = replica.author.robot
-        self._link = Link(api, map_name, branch=self._branch, has_epochs=replica.layer.has_epochs)
+        self._link = Link(api, map_name, branch=self._branch, has_epochs=lambda: replica.layer.has_epochs)
         # Cells that are held at all, by the limits; then the reports, and the lock that lets one round pass at a time.
         scope_box = scope.box(replica.geometry.cell_edge_m)
         self._budget = CellBudget(replica, limits, events, place=status.place, scope_box=scope_box)

@@ -170,3 +170,20 @@ def test_two_robots_with_other_orders_of_the_same_commits_have_the_same_cells(tm
         assert decode_layer_cell(body, A, WITH_EPOCHS).history == replica.view.history(A)
         replica.close()
     assert views[0] == views[1]
+
+
+def test_a_robot_that_began_without_a_link_goes_on_with_the_epochs_of_its_map(tmp_path: Path) -> None:
+    bat = opened(tmp_path / "bat", "bat")
+    first = bat.commit({A: X})
+    bat.take_epochs(WITH_EPOCHS)
+    committed(bat, Y, NOW)
+    assert first.meta.version == 1
+    assert bat.view.history(A) == rows(base=X, now=Y)
+    bat.close()
+    again = opened(tmp_path / "bat", "bat", layer=WITH_EPOCHS)
+    assert again.view.history(A) == rows(base=X, now=Y)
+    # What is of a server's map already stays what it is.
+    at(again, C1, rows(old=Z))
+    with pytest.raises(BadInputError, match="not voxels"):
+        again.take_epochs(WITH_EPOCHS)
+    again.close()
