@@ -1,9 +1,10 @@
-"""Stored bytes of format version 1: made once, kept for ever.
+"""Stored bytes of format versions 1 and 2: made once, kept for ever.
 
     python -m tests.formats.make_formats
 
 writes the files that are missing, never over one that is there: if the code writes other bytes today, the old ones
-must still decode. What they decode to is in `v1.json`.
+must still decode. What they decode to is in `v1.json` and `v2.json`. `before-epochs.*.zst` are a store, a backup and a
+robot's folder of the last version without epochs.
 """
 
 import json
@@ -13,9 +14,13 @@ import numpy as np
 from tests.naive.evidence import interleave
 
 from cairn_map.codec.cell_code import Profile, decode_cell, encode_cell
+from cairn_map.codec.history_code import decode_history, encode_history
 from cairn_map.commits.commit import CommitMeta, ScanPose, make_commit
 from cairn_map.commits.commit_reading import open_commit
 from cairn_map.commits.cursor import Cursor
+from cairn_map.epochs.cell_history import CellHistory, cell_history, history_fingerprint
+from cairn_map.epochs.epoch import BASE, Epoch
+from cairn_map.epochs.layer import MapLayer
 from cairn_map.evidence.channels import COLOUR, INTENSITY, TEMPERATURE, Channel, ChannelKind
 from cairn_map.evidence.evidence import Evidence, empty_evidence, packed_evidence
 from cairn_map.evidence.fingerprint import fingerprint
@@ -25,9 +30,12 @@ from cairn_map.wire.messages import Done, More, ReplyHeader
 
 CELLS = ("v1-all-channels.cell", "v1-signed.cell", "v1-empty.cell", "v1-small.cell")
 
+EPOCH_CELLS = ("v2-fast.cell", "v2-small.cell")
+
 FOLDER = Path(__file__).parent
 DOSE = Channel(kind=ChannelKind.SCALAR, name="dose", unit="µSv/h", step=0.01, zero=-1.5)
 GEOMETRY = Geometry(voxel_edge_um=40_000, depth=4, channels=(COLOUR, INTENSITY, TEMPERATURE, DOSE))
+LAYER = MapLayer(geometry=GEOMETRY, epoch_s=120)
 KEY = cell_key((-3, 2, 0))
 AUTHOR = "mole.0123456789abcdef"
 
@@ -86,6 +94,17 @@ def commit_bytes() -> bytes:
     return make_commit(meta, {KEY: evidence(), cell_key((0, 0, 0)): evidence()}, GEOMETRY).data
 
 
+def history() -> CellHistory:
+    """The base and two epochs, one of them before 1970."""
+    return cell_history({BASE: evidence(), Epoch(-3): wall(), Epoch(14_500_000): evidence()})
+
+
+def epoch_commit_bytes() -> bytes:
+    """A commit of one epoch."""
+    meta = CommitMeta(id=f"{AUTHOR}.8", layers=LAYER.identities, epoch=14_500_000, captured_s=(1.74e9, 1.74e9 + 30))
+    return make_commit(meta, {KEY: evidence(), cell_key((0, 0, 0)): wall()}, LAYER).data
+
+
 def cursor(seq: int) -> Cursor:
     """A made-up place in a made-up log."""
     return Cursor(bytes(range(16)), seq, bytes(range(16, 32)))
@@ -120,6 +139,9 @@ def made() -> dict[str, bytes]:
         "v1-empty.cell": encode_cell(KEY, empty_evidence(GEOMETRY), GEOMETRY).data,
         "v1.commit": commit_bytes(),
         "v1.reply": reply_bytes(),
+        "v2-fast.cell": encode_history(KEY, history(), LAYER).data,
+        "v2-small.cell": encode_history(KEY, history(), LAYER, profile=Profile.SMALL).data,
+        "v2.commit": epoch_commit_bytes(),
     }
 
 
@@ -140,6 +162,22 @@ def found() -> dict[str, object]:
     }
 
 
+def found_with_epochs() -> dict[str, object]:
+    """What the stored bytes of version 2 say today."""
+    cells = {name: decode_history((FOLDER / name).read_bytes()) for name in EPOCH_CELLS}
+    commit, _ = open_commit((FOLDER / "v2.commit").read_bytes())
+    return {
+        "layer": LAYER.digest().hex(),
+        "digests": {name: cell.digest.hex() for name, cell in cells.items()},
+        "epochs": {name: [*cell.history] for name, cell in cells.items()},
+        "fingerprints": {
+            name: history_fingerprint(cell.history, cell.key, layer_word=LAYER.word).hex()
+            for name, cell in cells.items()
+        },
+        "commit": {"sha": commit.sha.hex(), "meta": json.loads(commit.meta.model_dump_json())},
+    }
+
+
 def main() -> None:
     """Write what is missing."""
     for name, data in made().items():
@@ -147,6 +185,8 @@ def main() -> None:
             (FOLDER / name).write_bytes(data)
     if not (FOLDER / "v1.json").exists():
         (FOLDER / "v1.json").write_text(json.dumps(found(), indent=1, sort_keys=True) + "\n")
+    if not (FOLDER / "v2.json").exists():
+        (FOLDER / "v2.json").write_text(json.dumps(found_with_epochs(), indent=1, sort_keys=True) + "\n")
 
 
 if __name__ == "__main__":

@@ -3,11 +3,25 @@
 import json
 
 import pytest
-from tests.formats.make_formats import CELLS, FOLDER, GEOMETRY, KEY, evidence, found, wall
+from tests.formats.make_formats import (
+    CELLS,
+    EPOCH_CELLS,
+    FOLDER,
+    GEOMETRY,
+    KEY,
+    LAYER,
+    evidence,
+    found,
+    found_with_epochs,
+    history,
+    wall,
+)
 from tests.naive import cell_code as naive_cell_code
+from tests.naive import history as naive_history
 
 from cairn_map.codec.cell_code import decode_canonical_cell, decode_cell, encode_cell
 from cairn_map.codec.cell_reading import cell_reader
+from cairn_map.codec.history_code import check_canonical_history, decode_history
 from cairn_map.codec.octree.streams import MODELLED
 
 
@@ -38,3 +52,16 @@ def test_evidence_of_stored_cells_still_gives_their_digest(name: str) -> None:
 def test_the_second_decoder_reads_stored_cells_too(name: str) -> None:
     data = (FOLDER / name).read_bytes()
     assert naive_cell_code.decode_cell(data)[0]["digest"] == decode_cell(data).digest
+
+
+def test_stored_bytes_with_epochs_still_mean_what_they_meant() -> None:
+    assert found_with_epochs() == json.loads((FOLDER / "v2.json").read_text())
+
+
+@pytest.mark.parametrize("name", EPOCH_CELLS)
+def test_stored_cells_with_epochs_hold_their_rows_for_both_decoders(name: str) -> None:
+    data = (FOLDER / name).read_bytes()
+    check_canonical_history(data)
+    decoded = decode_history(data)
+    assert (decoded.key, decoded.layer, decoded.history) == (KEY, LAYER, history())
+    assert naive_history.decode_history(data)[0]["digest"] == decoded.digest
