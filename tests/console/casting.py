@@ -9,6 +9,7 @@ from tests.console.browsing import Console
 from tests.console.room import Room
 
 from cairn_client.cli.maps.map_export import fetch_map
+from cairn_map.epochs.present import shown_evidence
 from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.voxels import joined_voxels, voxels_of_evidence
 
@@ -40,9 +41,10 @@ class Occupied:
 def occupied(room: Room) -> Occupied:
     with room.api as api:
         info = api.map_info(room.name)
-        cells = [cell for _, cell in fetch_map(api, room.name)]
+        cells = [cell for _, cell in fetch_map(api, info)]
     model = info.sensor_model
-    parts = [voxels_of_evidence(c.key, c.evidence, info.geometry, model, occupied_only=True) for c in cells]
+    shown = {cell.key: shown_evidence(cell.history, info.layer, model) for cell in cells}
+    parts = [voxels_of_evidence(key, seen, info.geometry, model, occupied_only=True) for key, seen in shown.items()]
     found = joined_voxels(parts)
     heat, colour = (found.readings[name].mean for name in ("temperature", "colour"))
     return Occupied(found.numbers, found.counts, found.probability, heat, colour)

@@ -35,6 +35,7 @@ NameText = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,31}$")]
 IdText = Annotated[str, Field(max_length=96)]
 # Absent, not null or 0, where there are no epochs: programs of before refuse fields that they do not know.
 EpochLengthOrNone = Annotated[EpochLength | None, Field(exclude_if=lambda value: value is None)]
+SinceOrNone = Annotated[CursorText | Literal["cursor"] | None, Field(exclude_if=lambda value: value is None)]
 HistoryBytes = Annotated[Count, Field(exclude_if=lambda value: not value)]
 # Fail fast, else a few megabytes of wrong intervals become gigabytes of error messages.
 Interval = Annotated[list[int], Field(min_length=2, max_length=2), FailFast()]
@@ -220,7 +221,7 @@ class ReplyHeader(_Model):
     to: CursorText
     vector: VectorJson
     """Ids folded at or before `to`, and after `since` if that is there."""
-    since: CursorText | Literal["cursor"] | None = None
+    since: SinceOrNone = None
     """`since` of the request, if `vector` begins there; None: `vector` is whole."""
     stable: VectorJson
     """Ids of the asker's robot and of the operator that no restore can lose any more."""
