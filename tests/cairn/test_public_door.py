@@ -90,7 +90,7 @@ def test_things_say_what_they_are_in_one_line(tmp_path: Path) -> None:
         said = [repr(thing) for thing in (robot, scan, commit, robot.map, robot.snapshot(), path)]
     for text, begins in zip(
         said,
-        ("Robot(mole on map lab", "Scan(1500000001", "Commit(mole.", "EvidenceMap(", "MapSnapshot(", "PathStates(2"),
+        ("Robot(mole on map lab", "Scan(1500000001", "Commit(mole.", "HistoryMap(", "MapSnapshot(", "PathStates(2"),
         strict=True,
     ):
         assert text.startswith(begins), text
