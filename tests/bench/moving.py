@@ -69,7 +69,7 @@ def change_rows(smoke: bool) -> Iterator[Row]:
     """One line each: changes found and made up in the moving building, and what a static one seems to change."""
     layer = standing_layer(0.08 if smoke else 0.04)
     rounds = 5 if smoke else 10
-    given = rounds_of("moving-building", rounds, stops=2 if smoke else 4)
+    given = rounds_of("moving-building", rounds, stops=1 if smoke else 4)
     yield f"changes of the moving building, {len(given.scans)} scans, {rounds} rounds of 15 minutes", "", ""
     for sigma_m in (0.01,) if smoke else (0.0, 0.01, 0.02):
         cells = histories(measured(with_errors(given, PoseErrors(sigma_m=sigma_m)), layer), layer.geometry)
@@ -123,7 +123,7 @@ def settled_s(given: Recorded, until_s: float) -> float:
 
 def _static_change_rows(smoke: bool, layer: MapLayer) -> Iterator[Row]:
     rounds = 3 if smoke else 5
-    given = rounds_of("building", rounds, stops=2 if smoke else 4)
+    given = rounds_of("building", rounds, stops=1 if smoke else 4)
     yield (
         f"changes of the building that stands still, {len(given.scans)} scans in an hour, cut after each epoch",
         "",
@@ -153,7 +153,7 @@ def cut_anywhere(cells: Cells, geometry: Geometry) -> list[tuple[int, int, int]]
 def static_rows(smoke: bool) -> Iterator[Row]:
     """One line each: surfaces and free space with epochs and in one sum."""
     layer = standing_layer(0.08 if smoke else 0.04)
-    given = rounds_of("building", 2 if smoke else 5, stops=2 if smoke else 4)
+    given = rounds_of("building", 2 if smoke else 5, stops=1 if smoke else 4)
     truths: list[Truth] = []
     yield f"the building that stands still, {len(given.scans)} scans", "", ""
     for sigma_m in (0.015,) if smoke else (0.005, 0.015, 0.03):
