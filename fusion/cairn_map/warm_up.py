@@ -13,7 +13,7 @@ import numpy as np
 from cairn_map.codec.cell_code import Profile, decode_canonical_cell, encode_cell
 from cairn_map.codec.cell_reading import cell_reader
 from cairn_map.codec.view_code import decode_view, encode_view
-from cairn_map.epochs.cell_history import cell_history
+from cairn_map.epochs.cell_history import cell_history, row_fingerprint
 from cairn_map.epochs.cell_reading import CellReading
 from cairn_map.epochs.epoch import BASE, Epoch
 from cairn_map.epochs.present import present
@@ -61,6 +61,7 @@ def warm_up() -> None:
                     change(evidence)
             cell.packed()
         fingerprint(evidence, key)
+        row_fingerprint(evidence, Epoch(0), key, layer_word=0)
         largest(evidence.counts, evidence.samples)
         every_sum_has_weight(evidence.samples, geometry)
         channel_above(evidence.samples, planes_and_squares(geometry.channels), 1)
@@ -121,8 +122,10 @@ class _OneReading:
         reading = CellReading(self.geometry, model, lambda: rows)
         reading.cell()
         with suppress(BadInputError):
-            row.merge(self.evidence)
-            reading.note(Epoch(0), self.evidence, 1)
+            # One voxel: changes that take more memory than the cell has are dropped, and all rows read again.
+            grown = self.evidence.where(np.arange(len(self.evidence)) < 1)
+            row.merge(grown)
+            reading.note(Epoch(0), grown, 1)
         return {cell_key((0, 0, 0)): reading.cell()}
 
     def frozen_times(self) -> None:
