@@ -9,6 +9,7 @@ repeat.
 """
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -20,6 +21,7 @@ from tests.fixtures.sim.passes import Cells, Measured, histories, measured, reco
 from cairn_map.codec.cell_code import Profile, coding_of, decode_cell, encode_cell
 from cairn_map.codec.history_code import decode_history, encode_history
 from cairn_map.codec.layer_code import read_cell, row_coding, write_cell
+from cairn_map.codec.view_code import encode_view
 from cairn_map.epochs.cell_history import CellHistory, cell_history
 from cairn_map.epochs.epoch import BASE, Epoch
 from cairn_map.epochs.history_cell import HistoryCell
@@ -31,6 +33,7 @@ from cairn_map.evidence.channels import COLOUR, TEMPERATURE
 from cairn_map.evidence.evidence import Evidence, packed_evidence
 from cairn_map.evidence.grid import BRICK_DEPTH, CellKey, Geometry, geometry_for
 from cairn_map.evidence.inverse_sensor_model import SensorModel
+from cairn_map.evidence.view import FULL_STYLE, Extent
 from cairn_sim.robots.record import Plan
 from cairn_sim.robots.robots import ROBOTS
 from cairn_sim.scene.scene_file import load_scene
@@ -55,6 +58,7 @@ def pass_rows(smoke: bool) -> Iterator[Row]:
     )
     cells = _busiest(histories(_passes(layer, stops=3 if smoke else 9), layer.geometry), 3 if smoke else CELLS)
     yield from _byte_rows(cells, layer)
+    yield from _joiner_rows(cells, layer)
     yield from _time_rows(cells, layer, repeats=2 if smoke else 9)
 
 
@@ -107,6 +111,24 @@ def _byte_rows(cells: Cells, layer: MapLayer) -> Iterator[Row]:
             f"{size / 1e6:.1f}",
             f"MB = {size / many_sum:.1f} x one sum of {many_sum / 1e6:.2f} MB",
         )
+
+
+def _joiner_rows(cells: Cells, layer: MapLayer) -> Iterator[Row]:
+    """Bytes until who joins sees all cells as they are now: their views, before any row (rule S6)."""
+    many = _repeated(cells, MANY)
+    for text, seen in (("1 pass", _repeated(cells, 1)), (f"{MANY} passes", many)):
+        views = sum(_view_bytes(key, history, layer) for key, history in seen.items() if len(history))
+        rows = _bytes(seen, layer, Profile.FAST)
+        yield (
+            f"  until who joins sees the present of {text}",
+            f"{views / 1e6:.3f}",
+            f"MB; all rows, fast {rows / 1e6:.2f}",
+        )
+
+
+def _view_bytes(key: CellKey, history: CellHistory, layer: MapLayer) -> int:
+    read = present(history, layer.geometry, SensorModel()).evidence
+    return len(encode_view(key, read, layer.geometry, SensorModel(), style=replace(FULL_STYLE, extent=Extent.KNOWN)))
 
 
 def _repeated(cells: Cells, count: int) -> Cells:

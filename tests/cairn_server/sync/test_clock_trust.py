@@ -32,6 +32,7 @@ from cairn_server.store.store_rows import MapRow
 from cairn_server.sync.clock_trust import ClockTrust
 
 EPOCH_S = 120
+ASKS_TIME = {"Cairn-Format": "2"}
 JUMPS_S = {"ahead 40 days": 40 * DAY_S, "back 400 days": -400 * DAY_S, "three minutes": 180.0}
 
 
@@ -285,19 +286,22 @@ def served(folder: Path, clocks: HandClocks, **settings: Any) -> Live:
     return Live(folder, store=SqliteStore(folder, clocks.of_store()), **settings)
 
 
-def test_every_answer_says_the_time_while_it_is_trusted_and_an_admin_says_when_it_is(tmp_path: Path) -> None:
+def test_answers_say_the_time_where_it_is_asked_for_and_trusted_and_an_admin_says_when_it_is(
+    tmp_path: Path,
+) -> None:
     clocks = HandClocks()
     with served(tmp_path, clocks, admin_token=ADMIN, metrics_open=True) as live:
         chief = bearer(ADMIN)
         for path, status in (("/healthz", 200), ("/maps", 401), ("/nowhere", 404)):
-            answer = live.http.get(path)
+            answer = live.http.get(path, headers=ASKS_TIME)
+            assert "Cairn-Time" not in live.http.get(path).headers, "bytes for nothing"
             assert (answer.status_code, float(answer.headers["Cairn-Time"])) == (status, clocks.wall_s)
         assert "clock" not in live.http.get("/servers", headers=chief).json()
         assert live.http.get("/readyz").json() == {"status": "ready"}
         assert "cairn_clock_doubt_seconds 0.0\n" in live.http.get("/metrics").text
 
         clocks.wall_s += 40 * DAY_S
-        answer = live.http.get("/readyz")
+        answer = live.http.get("/readyz", headers=ASKS_TIME)
         assert "Cairn-Time" not in answer.headers and answer.status_code == 200
         assert answer.json()["degraded"].startswith("clock_jumped: ")
         assert live.http.get("/servers", headers=chief).json()["clock"] == answer.json()["degraded"]
@@ -308,7 +312,7 @@ def test_every_answer_says_the_time_while_it_is_trusted_and_an_admin_says_when_i
 
         assert kind_of(live.http.post("/clock")) == "no_token"
         assert live.http.post("/clock", headers=chief).json() == {"time_s": clocks.wall_s}
-        assert float(live.http.get("/healthz").headers["Cairn-Time"]) == clocks.wall_s
+        assert float(live.http.get("/healthz", headers=ASKS_TIME).headers["Cairn-Time"]) == clocks.wall_s
         clocks.wall_s = 12.0
         assert kind_of(live.http.post("/clock", headers=chief)) == "clock_behind"
 

@@ -20,7 +20,7 @@ from cairn_server.metrics import ServerFigures
 log = logging.getLogger(__name__)
 
 HEADER = b"x-request-id"
-TIME_HEADER = b"cairn-time"
+TIME_HEADER, FORMAT_HEADER = b"cairn-time", b"cairn-format"
 """UTC seconds since 1970 at the beginning of an answer, by which robots learn the lead of the server's clock."""
 SENSIBLE = re.compile(rb"[A-Za-z0-9._-]{1,64}")
 METHODS = frozenset({"GET", "PUT", "POST", "DELETE", "HEAD", "OPTIONS", "PATCH"})
@@ -59,6 +59,8 @@ class RequestTrail:
         # A jump is noticed before anything is done for this request.
         self._time_s()
         trail, start_s = Trail(), time.perf_counter()
+        # A client of maps with epochs; to others the time would be bytes for nothing.
+        asks_time = any(name == FORMAT_HEADER for name, _ in scope["headers"])
         request_id = _request_id(scope["headers"])
         reset = REQUEST_ID.set(request_id)
 
@@ -73,7 +75,7 @@ class RequestTrail:
                 headers = list(message.get("headers", ()))
                 trail.is_problem = (b"content-type", b"application/problem+json") in headers
                 headers.append((HEADER, request_id.encode()))
-                now_s = self._time_s()
+                now_s = self._time_s() if asks_time else None
                 if now_s is not None:
                     headers.append((TIME_HEADER, b"%.3f" % now_s))
                 message = {**message, "headers": headers}
