@@ -1,6 +1,6 @@
 """Switch each rule off in a copy of the tree, and see its test fail.
 
-$ python -m tests.rules_off 5 9                    # these rules; default: all
+$ python -m tests.rules_off 5 T6                   # these rules; default: all
 $ python -m tests.rules_off --simulated 300 5 9    # see a seed of `tests.sync_sim` go wrong instead
 
 Ends with 1 where a test notices nothing; simulated, where no switch of a rule is noticed by any of so many seeds (some
@@ -25,10 +25,10 @@ LIMIT_S = 300
 def main() -> int:
     """Print one line for each switch; 1 if one was not noticed."""
     parser = argparse.ArgumentParser("python -m tests.rules_off", description=__doc__)
-    parser.add_argument("rules", nargs="*", type=int, metavar="RULE", help="of SYNC.md (all)")
+    parser.add_argument("rules", nargs="*", type=_rule, metavar="RULE", help="5, T6 (all)")
     parser.add_argument("--simulated", type=int, metavar="SEEDS", help="simulate so many seeds instead")
     given = parser.parse_args()
-    noticed_by: dict[int, list[bool]] = {}
+    noticed_by: dict[int | str, list[bool]] = {}
     with tempfile.TemporaryDirectory() as name:
         tree = Path(name)
         for folder in (*FOLDERS, "tests"):
@@ -43,6 +43,10 @@ def main() -> int:
                 sys.stdout.flush()
     enough = any if given.simulated else all
     return int(not all(enough(noticed) for noticed in noticed_by.values()))
+
+
+def _rule(text: str) -> int | str:
+    return int(text) if text.isdigit() else text
 
 
 def is_noticed(tree: Path, switch: Switch, *, seeds: int | None) -> bool:

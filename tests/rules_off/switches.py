@@ -23,7 +23,8 @@ BASE = "client/cairn_client/replica/server_cells.py"
 class Switch:
     """One way to leave a rule out."""
 
-    rule: int
+    rule: int | str
+    """Number in SYNC.md; with a letter, of the rules of maps with epochs (FORMAT.md 16, PROTOCOL.md 4.13)."""
     without: str
     """What the rule says, that is not done then."""
     path: str
@@ -35,6 +36,62 @@ class Switch:
 
 # ruff: noqa: E501 - sources, as they are
 SWITCHES = (
+    Switch(
+        "T1",
+        "evidence goes into the row of its commit's epoch",
+        FOLDING,
+        "return self.cache.change(key, voxels_of(body), read, step, self, epoch=commit.epoch)",
+        "return self.cache.change(key, voxels_of(body), read, step, self)",
+        "cairn_server/folding/test_fold_epochs.py::test_any_order_of_commits_of_mixed_epochs_gives_their_rows_and_the_same_bytes",
+    ),
+    Switch(
+        "T1",
+        "a robot shows its commits in their own epochs",
+        OUTBOX,
+        "return cell_history({self._commits[commit].epoch: decode_row(",
+        "return cell_history({BASE: decode_row(",
+        "cairn_client/sync/test_epoch_frames.py::test_a_delta_adds_each_row_to_its_own_and_own_commits_to_theirs",
+    ),
+    Switch(
+        "T2",
+        "a commit from the future is refused",
+        "server/cairn_server/sync/checks/push_policy.py",
+        "if epoch <= epoch_of(now_s, epoch_s) + 1:",
+        "if True:",
+        "cairn_server/sync/test_clock_trust.py::test_the_epoch_after_the_present_one_is_the_last_that_is_taken",
+    ),
+    Switch(
+        "T2",
+        "an amend keeps the epoch of what it stands for",
+        OUTBOX,
+        "epoch = self._commits[latest].epoch if latest in self._commits else facts.epoch",
+        "epoch = facts.epoch",
+        "cairn_client/sync/test_epoch_frames.py::test_an_amend_keeps_the_epoch_of_what_it_stands_for",
+    ),
+    Switch(
+        "T3",
+        "a state frame speaks of all rows of its blocks",
+        "fusion/cairn_map/epochs/cell_history.py",
+        "return cell_history({epoch: without_blocks(row, blocks) for epoch, row in self.rows.items()})",
+        "return cell_history({epoch: without_blocks(row, blocks) if epoch == max(self.rows) else row for epoch, row in self.rows.items()})",
+        "cairn_client/sync/test_epoch_frames.py::test_a_state_frame_replaces_its_blocks_in_all_rows",
+    ),
+    Switch(
+        "T6",
+        "a retract takes evidence out of the row in which it lies",
+        BASE,
+        "                self.view.unmerge({key: evidence}, epoch=epoch)",
+        "                self.view.unmerge({key: evidence}, epoch=commit.meta.row)",
+        "cairn_client/sync/test_epoch_frames.py::test_a_retract_takes_evidence_out_of_the_row_of_its_target",
+    ),
+    Switch(
+        "T7",
+        "a fingerprint tells the epochs of evidence apart",
+        "fusion/cairn_map/epochs/cell_history.py",
+        "seeds = cell_seeds(cell) if epoch == BASE else epoch_seeds(cell, np.int64(epoch))",
+        "seeds = cell_seeds(cell)",
+        "cairn_client/sync/test_epoch_frames.py::test_evidence_in_the_row_of_another_epoch_is_noticed",
+    ),
     Switch(
         3,
         "of a header that cannot be read nothing is kept",

@@ -20,4 +20,5 @@ def test_a_switch_finds_its_place_once_and_its_test(switch: Switch) -> None:
 
 
 def test_every_rule_that_is_built_has_a_switch() -> None:
-    assert {switch.rule for switch in SWITCHES} | NOT_BUILT == set(range(1, 17))
+    rules = {switch.rule for switch in SWITCHES if isinstance(switch.rule, int)}
+    assert rules | NOT_BUILT == set(range(1, 17))
