@@ -359,7 +359,7 @@ def test_a_cell_whose_object_is_lost_is_rebuilt_from_the_log(store: ColdStore, d
     healed: list[CellRow] = []
     with store.snapshot(row) as snapshot:
         for key in before:
-            sound_cell(snapshot, key, SMALL, healed)
+            sound_cell(snapshot, key, row.layer, healed)
     assert [cell.body for cell in healed] == [before[healed[0].key].body]
     assert store.health.heal(row, healed[0])
     assert {key: cell.body for key, cell in cells_of(store, row).items()} == {k: c.body for k, c in before.items()}
