@@ -10,7 +10,6 @@ from tests.bench.pushing import Bodies, Diff
 from tests.bench.timing import cpu_s
 
 from cairn_map.commits.cursor import Cursor
-from cairn_map.evidence.blocks import of_blocks
 from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.wire.frames import CellFrame, frames_of
@@ -87,7 +86,8 @@ def _age_rows(service: Service, row: MapRow, cursor: Cursor, age: int, last_byte
             found = 0
             for cell in listed:
                 stamps = cache.stamps(snapshot, cell, row.geometry)
-                found += len(of_blocks(cache.evidence(snapshot, cell), blocks_after(stamps, cursor.seq)))
+                changed = cache.evidence(snapshot, cell, row.layer).of_blocks(blocks_after(stamps, cursor.seq))
+                found += sum(map(len, changed.rows.values()))
             return found
 
         start_s = time.process_time()

@@ -153,7 +153,7 @@ class Replica:
         )
 
     def take_epochs(self, layer: MapLayer) -> None:
-        """Go on as a robot of a map with epochs, of the same grid, which no server had told it before.
+        """Go on as a robot of a map with epochs, of the same grid, whose epochs it did not know.
 
         Its commits until now state no epoch: they are of the base there, as those of any robot that never learnt the
         server's time.
