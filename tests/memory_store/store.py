@@ -150,9 +150,12 @@ class MemoryStore:
             return kept.stored() if kept else None
 
     def kept_sha(self, row: MapRow, commit: CommitId) -> bytes | None:
-        """SHA-256 of a commit whose evidence is kept, folded or not; None if there is none."""
-        found = self.commit(row, commit)
-        return found.sha if found and not found.gone else None
+        """SHA-256 of a commit whose bytes are not wanted; None of any other."""
+        with self._maps.reading(row) as state:
+            kept = state.commits.get(commit)
+            if kept is None or kept.is_damaged or (kept.is_gone and commit not in state.retracted):
+                return None
+            return kept.new.sha
 
     def folded(self, row: MapRow, commit: CommitId) -> StoredCommit | None:
         """A folded commit with its diff, or None."""

@@ -502,7 +502,10 @@ class Store(Protocol):
         ...
 
     def kept_sha(self, row: MapRow, commit: CommitId) -> bytes | None:
-        """SHA-256 of a commit whose evidence is kept, folded or not; None if there is none. No evidence is read."""
+        """SHA-256 of a commit whose bytes are not wanted, folded or not; None of any other. No evidence is read.
+
+        They are kept, or its evidence is gone and it is taken out for good. Those of a damaged one are wanted.
+        """
         ...
 
     def folded(self, row: MapRow, commit: CommitId) -> StoredCommit | None:

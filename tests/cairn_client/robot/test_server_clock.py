@@ -9,15 +9,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from tests.fixtures.client.live_server import LiveServer
+from tests.fixtures.client.made import GEOMETRY
 from tests.fixtures.clocks import DAY_S, NOW_S, HandClocks
 
 from cairn_client.http.answer_reading import time_sample
+from cairn_client.http.api import MapApi
 from cairn_client.replica.replica_state import ReplicaState
 from cairn_client.replica.replica_store import ReplicaStore
 from cairn_client.robot.robot import Robot
 from cairn_client.robot.server_clock import ERROR_MAX_S, ServerClock, Times
 from cairn_client.sync.responses import TimeSample
 from cairn_map.epochs.epoch import epoch_of
+from cairn_map.wire.messages import CreateMap
 
 EPOCH_S = 120
 
@@ -155,9 +158,11 @@ def test_no_scan_is_dated_later_than_it_was_taken(
 
 
 def test_a_robot_learns_the_servers_time_by_registering_and_by_each_sync(server: LiveServer, tmp_path: Path) -> None:
+    with MapApi(server.url) as api:
+        api.create_map("epochs", CreateMap(geometry=GEOMETRY, epoch_s=600))
     clocks = HandClocks(wall_s=12.0)
     options = {"directory": tmp_path / "eye", "name": "eye", "clocks": clocks.of_machine()}
-    with Robot(None, server.map_url, **options) as eye:
+    with Robot(None, f"{server.url}/maps/epochs", **options) as eye:
         before_s = time.time()
         assert eye._clock.now_s() is None
         eye.sync()

@@ -199,6 +199,7 @@ def test_a_robot_s_cells_span_the_map_s_extent_and_a_retract_makes_room(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(quotas, "BOX_EVERY_S", 0.0)
+    monkeypatch.setattr(quotas, "BOX_PAUSE_FACTOR", 0.0)
     edge_m = SMALL.cell_edge_m
     with guarded(tmp_path, map_extent_m=10 * edge_m) as live:
         row = live.new_map()

@@ -131,6 +131,20 @@ def test_where_the_push_must_wait_an_empty_part_tries_again(live: Live, monkeypa
     assert add(live, row, b"", len(COMMIT.data)).status_code == 201
 
 
+def test_a_commit_that_was_taken_out_and_forgotten_comes_to_its_end_in_parts(live: Live) -> None:
+    row = live.new_map()
+    live.push(row, COMMIT)
+    live.folded(row)
+    assert live.retract(row, COMMIT).status_code == 201
+    live.folded(row)
+    assert live.service.store.forget_evidence(row, before_s=float("inf"), limit=100) == 1
+    assert state(live, row)["sha"] == COMMIT.sha.hex()
+    half = len(COMMIT.data) // 2
+    add(live, row, COMMIT.data[:half], 0)
+    last = add(live, row, COMMIT.data[half:], half)
+    assert (last.status_code, last.json()) == (200, {"size_bytes": len(COMMIT.data), "sha": COMMIT.sha.hex()})
+
+
 class Staging:
     """Uploads without a server, and their clock."""
 

@@ -142,10 +142,13 @@ class PgReads:
         return self._commit(row, commit, ONE)
 
     def kept_sha(self, row: MapRow, commit: CommitId) -> bytes | None:
-        """SHA-256 of a commit whose evidence is kept, folded or not; None if there is none. No evidence is read."""
-        query = f"SELECT sha FROM commits WHERE {OF_COMMIT} AND NOT gone"
+        """SHA-256 of a commit whose bytes are not wanted; None of any other."""
+        query = (
+            f"SELECT sha FROM commits WHERE {OF_COMMIT} AND damaged IS NULL"
+            " AND (NOT gone OR EXISTS (SELECT FROM retracted WHERE retracted.map = commits.map AND id = %s))"
+        )
         with self._connections.lent() as connection:
-            sha: bytes | None = first(connection, query, (row.number, *commit.author, commit.n))
+            sha: bytes | None = first(connection, query, (row.number, *commit.author, commit.n, str(commit)))
         return sha
 
     def folded(self, row: MapRow, commit: CommitId) -> StoredCommit | None:

@@ -73,10 +73,13 @@ class SqliteReads:
         return self._commit("map = ? AND robot = ? AND incarnation = ? AND n = ?", row, commit)
 
     def kept_sha(self, row: MapRow, commit: CommitId) -> bytes | None:
-        """SHA-256 of a commit whose evidence is kept, folded or not; None if there is none. No evidence is read."""
-        query = "SELECT sha FROM commits WHERE map = ? AND robot = ? AND incarnation = ? AND n = ? AND gone = 0"
+        """SHA-256 of a commit whose bytes are not wanted; None of any other."""
+        query = (
+            "SELECT sha FROM commits WHERE map = ?1 AND robot = ?2 AND incarnation = ?3 AND n = ?4 AND damaged IS NULL"
+            " AND (gone = 0 OR EXISTS (SELECT 1 FROM retracted WHERE map = ?1 AND id = ?5))"
+        )
         with self._readers.reading() as reader:
-            sha: bytes | None = first(reader, query, (row.number, *commit.author, commit.n))
+            sha: bytes | None = first(reader, query, (row.number, *commit.author, commit.n, str(commit)))
         return sha
 
     def folded(self, row: MapRow, commit: CommitId) -> StoredCommit | None:
