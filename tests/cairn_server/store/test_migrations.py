@@ -14,7 +14,7 @@ from tests.fixtures.server.answers import kind_of
 from tests.fixtures.server.commit_contract import bodies, folded_map
 from tests.fixtures.server.epoch_contract import EPOCHS, cell_of, commit_in, fold_by_hand, map_with_epochs, totals_of
 from tests.fixtures.server.live import Live
-from tests.fixtures.server.old_stores import FORMATS, OLD_COMMITS, OLD_RETRACTS, unpacked
+from tests.fixtures.server.old_stores import OLD_COMMITS, OLD_RETRACTS, unpacked
 from tests.fixtures.server.pushes import KEYS, MOLE, WREN, pushed, read, sum_of
 from tests.fixtures.server.shares_contract import author_of, regions_of
 from tests.fixtures.server.store_contract import new_of
