@@ -115,8 +115,15 @@ def _byte_rows(cells: Cells, layer: MapLayer) -> Iterator[Row]:
 
 def _joiner_rows(cells: Cells, layer: MapLayer) -> Iterator[Row]:
     """Bytes until who joins sees all cells as they are now: their views, before any row (rule S6)."""
-    many = _repeated(cells, MANY)
-    for text, seen in (("1 pass", _repeated(cells, 1)), (f"{MANY} passes", many)):
+    first = min(epoch for history in cells.values() for epoch in history)
+    alone = {key: cell_history({first: history.rows[first]}) for key, history in cells.items() if first in history.rows}
+    passes = len({epoch for history in cells.values() for epoch in history})
+    for text, seen in (
+        ("1 pass", alone),
+        (f"{MANY} passes, the same place", _repeated(alone, MANY)),
+        (f"{passes} passes", cells),
+        (f"{MANY} passes, the {passes} repeated", _repeated(cells, MANY)),
+    ):
         views = sum(_view_bytes(key, history, layer) for key, history in seen.items() if len(history))
         rows = _bytes(seen, layer, Profile.FAST)
         yield (
@@ -181,20 +188,24 @@ def _time_rows(cells: Cells, layer: MapLayer, *, repeats: int) -> Iterator[Row]:
 
 
 def _memory_rows(cells: Cells, layer: MapLayer) -> Iterator[Row]:
-    """Memory of a robot's map that got the passes one after another."""
+    """Memory of a robot's map that got the passes one after another, and is read."""
     geometry, passes = layer.geometry, sorted({epoch for history in cells.values() for epoch in history})
     maps = [HistoryMap(each, coding=coding_of(geometry)) for each in (layer, MapLayer(geometry=geometry))]
     for epoch in passes:
         diff = {key: history.rows[epoch] for key, history in cells.items() if epoch in history.rows}
         maps[0].merge(diff, epoch=epoch)
         maps[1].merge(diff)
-    held, one_sum = (each.size_bytes for each in maps)
-    ratio = held / one_sum
-    yield (
-        "memory of a map of these passes",
-        f"{held / 1e6:.1f}",
-        f"MB = {ratio:.2f} x one sum of {one_sum / 1e6:.1f} MB",
-    )
+    for each in maps:
+        each.frozen_cells(SensorModel())
+    for text, rests in (("growing", 0), ("at rest", 2)):
+        for _ in range(rests):
+            maps[0].rest()
+        held, one_sum = (each.size_bytes + each.reading_bytes for each in maps)
+        yield (
+            f"memory of a map of these passes, read, {text}",
+            f"{held / 1e6:.1f}",
+            f"MB = {held / one_sum:.2f} x one sum of {one_sum / 1e6:.1f} MB",
+        )
 
 
 def _there_and_back(merge: Step, unmerge: Step, evidence: Evidence) -> None:

@@ -86,6 +86,7 @@ def fetch(
     )
     if box is not None:  # what is outside never comes, so own commits must not wait for it
         replica.forget_stable_commits(wanted=is_in_scope)
+    replica.rest()
     return report
 
 

@@ -9,6 +9,7 @@ read from its rows again. What is closed is made when the newest row first grows
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -29,6 +30,7 @@ from cairn_map.evidence.inverse_sensor_model import SensorModel
 
 HASH_BITS = 17
 """Bits of the hash table of log-odds: twice as many places as there can be different ones."""
+SAMPLE_TYPES: tuple[type[np.integer[Any]], ...] = (np.uint8, np.int16, np.int32, np.uint32, np.int64)
 Rows = Mapping[Epoch, HeldCell]
 """Rows of one cell in any order; they may be empty."""
 
@@ -140,8 +142,8 @@ class _ClosedRows:
     """(B, 512) log-odds after all of these rows, in the bricks of the reading: their numbers in the palette."""
     palette: Floats
     """(K,) different log-odds; 0 is the first."""
-    samples: tuple[tuple[Words32, npt.NDArray[np.int64]], ...]
-    """Samples of the rows that may be joined, the newest row first: (S,) voxels, rising, and (S, P) sums."""
+    samples: tuple["_Samples", ...]
+    """Samples of the rows that may be joined, the newest row first."""
 
     @classmethod
     def of_rows(
@@ -165,8 +167,7 @@ class _ClosedRows:
 
     @property
     def size_bytes(self) -> int:
-        samples = sum(at.nbytes + sums.nbytes for at, sums in self.samples)
-        return self.codes.nbytes + self.palette.nbytes + samples
+        return self.codes.nbytes + self.palette.nbytes + sum(samples.size_bytes for samples in self.samples)
 
     def read(self, row: Evidence, bricks: BrickCounts, geometry: Geometry, model: SensorModel) -> Evidence:
         """Reading of some voxels: these rows, and then the newest.
@@ -190,11 +191,42 @@ class _ClosedRows:
         # R4: the newest row's samples, and then the others'.
         shown = ShownSamples(V, geometry)
         shown.join(row.voxels, row.voxels[row.sampled], row.samples, 1, counts.free_after)
-        for at, sums in self.samples:
-            here, places = _places(row.voxels, at)
-            shown.join(row.voxels, row.voxels[here], sums[places], 0, counts.free_after)
+        for samples in self.samples:
+            here, places = _places(row.voxels, samples.voxels)
+            shown.join(row.voxels, row.voxels[here], samples.sums(places), 0, counts.free_after)
         sampled = np.flatnonzero((shown.samples != 0).any(axis=1))
         return Evidence(row.voxels, row.counts, sampled.astype(np.uint32), shown.samples[sampled], counts.odds)
+
+
+class _Samples(NamedTuple):
+    """Samples of some voxels of one row, in as few bytes as they fit into."""
+
+    voxels: Words32
+    """(S,) rising."""
+    planes: tuple[npt.NDArray[np.integer[Any]], ...]
+    """P times (S,) sums, each plane in the smallest integers that hold it: of most planes 1 or 2 bytes."""
+
+    @classmethod
+    def of_sums(cls, voxels: Words32, sums: npt.NDArray[np.int64]) -> "_Samples":
+        """Samples of (S,) voxels, 1 at least, from their (S, P) sums."""
+        spans = zip(sums.min(axis=0).tolist(), sums.max(axis=0).tolist(), strict=True)
+        types = [next(each for each in SAMPLE_TYPES if _holds(each, *span)) for span in spans]
+        return cls(voxels, tuple(plane.astype(dtype) for plane, dtype in zip(sums.T, types, strict=True)))
+
+    def sums(self, places: npt.NDArray[np.intp]) -> npt.NDArray[np.int64]:
+        """(n, P) sums at n places."""
+        found = np.empty((len(places), len(self.planes)), np.int64)
+        for number, plane in enumerate(self.planes):
+            found[:, number] = plane[places]
+        return found
+
+    @property
+    def size_bytes(self) -> int:
+        return self.voxels.nbytes + sum(plane.nbytes for plane in self.planes)
+
+
+def _holds(dtype: type[np.integer[Any]], low: int, high: int) -> bool:
+    return int(np.iinfo(dtype).min) <= low and high <= int(np.iinfo(dtype).max)
 
 
 def voxel_times_s(rows: Rows, voxels: Words32, epoch_s: int) -> Floats:
@@ -233,7 +265,7 @@ def _places(voxels: Words32, among: Words32) -> tuple[npt.NDArray[np.intp], npt.
 
 def _joinable(
     rows: Sequence[Evidence], voxels: Words32, counts: ReadCounts, geometry: Geometry
-) -> tuple[tuple[Words32, npt.NDArray[np.int64]], ...]:
+) -> tuple[_Samples, ...]:
     """Samples of rows, the oldest first, that rule R4 may join to those of a newer one; the newest row's come first."""
     planes, _ = planes_and_squares(geometry.channels).T
     weights = np.cumsum(planes) - 1
@@ -248,7 +280,7 @@ def _joinable(
         needed = ((mine > 0) & (enough[places] < JOINED_MIN)).any(axis=1) & (number >= free_after[places])
         enough[places] += np.minimum(mine, JOINED_MIN)
         if needed.any():
-            found.append((at[needed], row.samples[needed]))
+            found.append(_Samples.of_sums(at[needed], row.samples[needed]))
     return tuple(found)
 
 

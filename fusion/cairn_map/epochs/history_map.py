@@ -35,6 +35,8 @@ class HistoryMap:
         self._shown: dict[CellKey, HeldCell] = {}
         """Readings of cells whose rows are still to come, by number."""
         self._reading: MapReading | None = None
+        self._touched: set[CellKey] = set()
+        """Cells that changed since the last `rest`."""
 
     def __iter__(self) -> Iterator[CellKey]:
         return iter(sorted(set().union(*self._rows.values())))
@@ -107,6 +109,7 @@ class HistoryMap:
             BadInputError: kind `evidence_overflow`; nothing was changed.
         """
         self._of(epoch).merge(diff, bodies=bodies)
+        self._touched |= diff.keys()
         if self._reading is not None:
             self._reading.note(diff, epoch=epoch, sign=1)
 
@@ -117,6 +120,7 @@ class HistoryMap:
             BadInputError: kind `evidence_overflow`; nothing was changed.
         """
         self._of(epoch).unmerge(diff)
+        self._touched |= diff.keys()
         if self._reading is not None:
             self._reading.note(diff, epoch=epoch, sign=-1)
 
@@ -136,6 +140,7 @@ class HistoryMap:
         for epoch, row in history.rows.items():
             self._of(epoch).replace(key, row, body=bodies.get(epoch), came_bytes=came_bytes)
         self._shown.pop(key, None)
+        self._touched.add(key)
         if self._reading is not None:
             self._reading.forget((key,))
 
@@ -143,6 +148,18 @@ class HistoryMap:
         """Show a cell as this reading, made by the server, until rows of it come (rule S6)."""
         if key not in self:
             self._shown[key] = reading
+
+    def rest(self) -> None:
+        """Hold what did not change since the last call in little memory until it changes again; once a minute, say.
+
+        A map without epochs stays as it is.
+        """
+        newest = self._rows[max(self._rows)]
+        if self.layer.has_epochs:
+            newest.rest_cells([key for key in newest if key not in self._touched])
+            if self._reading is not None:
+                self._reading.rest(except_of=self._touched)
+        self._touched.clear()
 
     def copy(self) -> "HistoryMap":
         """The same rows, unaffected by later merges; cells share their arrays until one of the two is changed."""
@@ -195,6 +212,7 @@ class HistoryMap:
         """Drop all cells."""
         self._rows = {BASE: EvidenceMap(self.geometry, coding=self._coding)}
         self._shown.clear()
+        self._touched.clear()
         self._reading = None
 
     def _of(self, epoch: Epoch) -> EvidenceMap:

@@ -7,7 +7,7 @@ A map that keeps one reports each merge by `note`, and any other change by `forg
 cells again. A cell whose rows have few bytes and whose reading would take much memory is read where it is asked for.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from typing import Protocol
@@ -107,10 +107,11 @@ class MapReading:
             self._cells.pop(key, None)
             self._compact.pop(key, None)
 
-    def rest(self) -> None:
-        """Drop what only helps rows to grow on."""
-        for reading in self._cells.values():
-            reading.rest()
+    def rest(self, *, except_of: Collection[CellKey] = ()) -> None:
+        """Drop what only helps rows to grow on, except of some cells."""
+        for key, reading in self._cells.items():
+            if key not in except_of:
+                reading.rest()
 
     def frozen_cells(self, model: SensorModel) -> dict[CellKey, HeldCell]:
         """All cells, rising in number, unaffected by later changes of the map."""

@@ -8,7 +8,7 @@ it keeps the cell's bytes, and decodes them where they are read or changed, one 
 """
 
 import hashlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -128,9 +128,16 @@ class EvidenceMap:
         Without a coding the map stays as it is.
         """
         self._rests = self._coding is not None
-        for key, entry in list(self._cells.items()):
-            if isinstance(entry.cell, BrickCell):
-                self._hold(key, entry.cell, body=None, came_bytes=entry.came_bytes)
+        self.rest_cells(list(self._cells))
+
+    def rest_cells(self, keys: Iterable[CellKey]) -> None:
+        """Hold some cells as their bytes until they change."""
+        for key in keys:
+            entry = self._cells[key]
+            if self._coding is not None and isinstance(entry.cell, BrickCell):
+                body = self._coding.encode(key, entry.cell.packed())
+                came_bytes = max(entry.came_bytes, len(body))
+                self._put(key, CompactCell(body, self.geometry, self._coding), came_bytes)
 
     def copy(self) -> "EvidenceMap":
         """The same sums, unaffected by later merges; cells share their arrays until one of the two is changed."""

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from tests.fixtures.map.histories import change, epoch_map
 from tests.fixtures.map.made import KEY, SMALL, random_evidence
 
-from cairn_map.epochs.cell_reading import CellReading, voxel_times_s
+from cairn_map.epochs.cell_reading import CellReading, _Samples, voxel_times_s
 from cairn_map.epochs.epoch import BASE, Epoch
 from cairn_map.epochs.history_map import HistoryMap
 from cairn_map.epochs.present import present
@@ -81,6 +81,20 @@ def test_a_row_that_grows_leaves_the_others_as_bytes(monkeypatch: pytest.MonkeyP
         reading.cell()
     assert len(decoded) == 2
     assert reading.cell().packed() == expected(rows)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "plane_bytes"),
+    [(0, 255, 1), (-1, 255, 2), (0, 256, 2), (-(2**15), 2**15, 4), (0, 2**31, 4), (-1, 2**31, 8), (0, 2**32, 8)],
+)
+def test_samples_of_closed_rows_take_few_bytes_and_come_back_as_they_were(
+    low: int, high: int, plane_bytes: int
+) -> None:
+    sums = np.array([[low, 1], [high, 2], [0, 3]], np.int64)
+    samples = _Samples.of_sums(np.arange(3, dtype=np.uint32), sums)
+    assert samples.size_bytes == 3 * (4 + plane_bytes + 1)
+    places = np.array([2, 0, 1])
+    np.testing.assert_array_equal(samples.sums(places), sums[places])
 
 
 def test_a_copy_of_the_reading_does_not_change() -> None:

@@ -19,7 +19,9 @@ from cairn_map.errors import BadInputError, DamagedDataError
 from cairn_map.evidence.brick_cell import sum_evidence
 from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.grid import CellKey, cell_key
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 
+MODEL = SensorModel()
 PLAIN = MapLayer(geometry=SMALL)
 EVIDENCE = st.integers(0, 50).map(lambda seed: random_evidence(seed, SMALL))
 """Evidence whose sums fit."""
@@ -147,6 +149,44 @@ def test_rows_of_older_epochs_rest_as_bytes_and_a_copy_stays_as_it_was() -> None
     whole.merge({KEY: random_evidence(9, SMALL)}, epoch=Epoch(1))
     assert copied.history(KEY) == cell_history(rows)
     assert copied != whole
+
+
+@given(st.lists(st.tuples(EPOCHS, EVIDENCE, st.sampled_from(["merge", "unmerge", "rest", "read"])), max_size=9))
+def test_a_map_that_rests_now_and_then_is_the_same_and_reads_the_same(steps: list) -> None:  # type: ignore[type-arg]
+    resting, other = HistoryMap(LAYER, coding=coding_of(SMALL)), HistoryMap(LAYER)
+    merged_ones = []
+    for epoch, evidence, step in steps:
+        if step == "rest":
+            resting.rest()
+        elif step == "read":
+            read = [{key: cell.packed() for key, cell in each.frozen_cells(MODEL).items()} for each in (resting, other)]
+            assert read[0] == read[1]
+        elif step == "merge" or not merged_ones:
+            merged_ones.append((epoch, evidence))
+            for each in (resting, other):
+                each.merge({KEY: evidence}, epoch=epoch)
+        else:
+            epoch, evidence = merged_ones.pop()
+            for each in (resting, other):
+                each.unmerge({KEY: evidence}, epoch=epoch)
+    assert resting == other
+
+
+def test_cells_that_did_not_change_since_the_last_rest_are_held_as_bytes() -> None:
+    whole, other = HistoryMap(LAYER, coding=coding_of(SMALL)), cell_key((3, 0, 0))
+    for key in (KEY, other):
+        whole.merge({key: random_evidence(1, SMALL)}, epoch=Epoch(1))
+    open_bytes = whole.cell_bytes(KEY)
+    whole.rest()
+    assert whole.cell_bytes(KEY) == open_bytes
+    whole.merge({other: random_evidence(2, SMALL)}, epoch=Epoch(1))
+    whole.rest()
+    assert whole.cell_bytes(KEY) < open_bytes <= whole.cell_bytes(other)
+    plain = HistoryMap(PLAIN, coding=coding_of(SMALL))
+    plain.merge({KEY: random_evidence(1, SMALL)})
+    plain.rest()
+    plain.rest()
+    assert plain.cell_bytes(KEY) == open_bytes
 
 
 def test_replacing_a_cell_makes_it_hold_these_rows_alone() -> None:
