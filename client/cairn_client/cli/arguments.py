@@ -82,6 +82,13 @@ def add_map_parser(commands: Subparsers, name: str, run: Run, *, text: str) -> a
     return added
 
 
+def add_at(parser: argparse.ArgumentParser) -> None:
+    """Add `--at`, a time as `seconds_of` reads it."""
+    parser.add_argument(
+        "--at", metavar="TIME", help="the map as it was at a time of capture (14:05, 2026-11-27T14:05, else UTC); now"
+    )
+
+
 class AddTokens(argparse.Action):
     """Action of `--token`: a token for the command's first URL, or for the server that it names."""
 

@@ -11,7 +11,8 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from cairn_map.epochs.epoch import EPOCH_S_MAX
+from cairn_map.epochs.epoch import EPOCH_S_MAX, Epoch, epoch_of
+from cairn_map.errors import ConflictError
 from cairn_map.evidence.grid import Geometry
 
 EVIDENCE = "evidence"
@@ -64,6 +65,21 @@ class MapLayer(BaseModel, frozen=True):
         if self.epoch_s is None:
             return ()
         return (LayerIdentity(geometry=self.geometry.digest().hex(), epoch_s=self.epoch_s, name=self.name),)
+
+    def epoch_at(self, time_s: float) -> Epoch:
+        """Epoch of a time, UTC seconds since 1970.
+
+        Raises:
+            ConflictError: kind `not_known`: a map without epochs holds one sum, and knows nothing of earlier times.
+            BadInputError: kind `bad_epoch`.
+        """
+        if self.epoch_s is None:
+            raise ConflictError(
+                "not_known",
+                "this map has no epochs: it holds one sum for all times. Ask its server, which may have kept the "
+                "commits, or make maps with `cairn map create --epoch 120`",
+            )
+        return epoch_of(time_s, self.epoch_s)
 
     def digest(self) -> bytes:
         """SHA-256 (32 bytes) over the definition; evidence can be added only if the digests are equal."""

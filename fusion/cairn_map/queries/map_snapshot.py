@@ -23,10 +23,8 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_map.arrays import Floats
-from cairn_map.epochs.epoch import epoch_of
 from cairn_map.epochs.history_map import HistoryMap
 from cairn_map.epochs.map_reading import MapReading
-from cairn_map.errors import ConflictError
 from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.grid import Cell, Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
@@ -258,11 +256,4 @@ def snapshot_at(whole: HistoryMap, model: SensorModel, time_s: float) -> MapSnap
         ConflictError: kind `not_known`: a map without epochs holds one sum, and knows nothing of earlier times.
         BadInputError: kind `bad_epoch`.
     """
-    epoch_s = whole.layer.epoch_s
-    if epoch_s is None:
-        raise ConflictError(
-            "not_known",
-            "this map has no epochs: it holds one sum for all times. Ask its server, which may have kept the commits, "
-            "or make maps with `cairn map create --epoch 120`",
-        )
-    return snapshot_of(MapReading(whole.copy(), at=epoch_of(time_s, epoch_s)), model)
+    return snapshot_of(MapReading(whole.copy(), at=whole.layer.epoch_at(time_s)), model)

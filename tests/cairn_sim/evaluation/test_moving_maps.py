@@ -115,7 +115,7 @@ def test_thin_things_are_not_lost() -> None:
 def test_what_changed_is_found_and_nothing_else() -> None:
     held, given = cells("moving-building", 4, 0.01), rounds("moving-building", 4)
     scores, at_guard = hour_scores(held, given, LAYER.geometry, AFTER_ROUND_S, lasts_s=3 * ROUND_S)
-    assert scores.read > 50
+    assert scores.shown > 50
     assert scores.recall >= 0.9
     assert scores.false < 10
     # The guard came and went within that time.
@@ -129,4 +129,4 @@ def test_nothing_has_changed_in_a_building_that_stands_still_wherever_it_is_cut(
 
 
 def test_scores_count_false_reports() -> None:
-    assert (ChangeScores(read=4, found=2, false=1) + ChangeScores(read=4, found_moved=4)).recall_moved == 0.75
+    assert (ChangeScores(shown=4, found=2, false=1) + ChangeScores(shown=4, found_moved=4)).recall_moved == 0.75

@@ -17,10 +17,11 @@ from urllib.parse import urlencode
 
 from pydantic import ValidationError
 
-from cairn_client.cli.arguments import Subparsers, add_map_parser, api_of, say, shown_bytes
+from cairn_client.cli.arguments import Subparsers, add_at, add_map_parser, api_of, say, seconds_of, shown_bytes
 from cairn_client.http.api import MapApi
 from cairn_client.http.http_link import cells_with_evidence, download_cell
 from cairn_map.codec.history_code import DecodedHistory
+from cairn_map.epochs.epoch import Epoch
 from cairn_map.epochs.present import shown_evidence
 from cairn_map.errors import BadInputError, NotFoundError, first_error
 from cairn_map.evidence.grid import cell_from_text, cell_key, cell_of_key
@@ -34,6 +35,7 @@ from cairn_map.wire.messages import MapInfo
 
 FORMATS = ("ply", "pcd", "laz", "npz", "ot", "bt")
 ZERO_CELSIUS_K = 273.15
+WHOLE_AT = "cells hold evidence of all times: --at goes with files of voxels"
 VOXEL_BYTES = 300
 """Memory of a voxel on its way into a file: a row with all channels has 136, and is there twice while it is joined."""
 EXPORT_BYTES_MAX = 64 << 28
@@ -45,6 +47,7 @@ def add_get_parser(commands: Subparsers) -> None:
     get = add_map_parser(commands, "get", _get, text="download one cell")
     get.add_argument("cell", type=str.strip, help="its number, i,j,k")
     get.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help=".cell, .npz, .ply or .view")
+    add_at(get)
 
 
 def add_export_parser(commands: Subparsers) -> None:
@@ -57,6 +60,7 @@ def add_export_parser(commands: Subparsers) -> None:
     export.add_argument(
         "--ceiling", type=float, metavar="METRES", help="leave out higher voxels; with --picture, in the picture alone"
     )
+    add_at(export)
     _add_part_arguments(export)
 
 
@@ -100,7 +104,9 @@ def _get(args: argparse.Namespace) -> int:
         info = api.map_info(name)
         cell = cell_from_text(args.cell)
         body, decoded = download_cell(api, name, cell_key(cell), info.layer)
-    evidence = shown_evidence(decoded.history, info.layer, info.sensor_model)
+    if suffix == ".cell" and args.at is not None:
+        raise BadInputError("bad_option", WHOLE_AT)
+    evidence = shown_evidence(decoded.history, info.layer, info.sensor_model, at=_epoch(args, info))
     if suffix == ".cell":
         data = body
     else:
@@ -121,6 +127,8 @@ def _export(args: argparse.Namespace) -> int:
         return 0
     if not (args.cells or args.ply or args.npz or args.picture):
         raise BadInputError("nothing_asked", "say what to write: --cells DIR, --ply FILE, --npz FILE or --picture FILE")
+    if args.cells and args.at is not None:
+        raise BadInputError("bad_option", WHOLE_AT)
     _check_outputs(args.ply, args.npz, args.picture)
     api, name = api_of(args.map, args.token)
     with api:
@@ -163,7 +171,7 @@ def _downloaded(api: MapApi, info: MapInfo, args: argparse.Namespace) -> tuple[_
     Raises:
         BadInputError: kind `too_large`: the voxels do not fit into the memory. A few bytes may stand for millions.
     """
-    kept, count, size_bytes = _Kept([], []), 0, 0
+    kept, count, size_bytes, at = _Kept([], []), 0, 0, _epoch(args, info)
     for body, cell in fetch_map(api, info):
         count += 1
         if args.cells:
@@ -171,12 +179,22 @@ def _downloaded(api: MapApi, info: MapInfo, args: argparse.Namespace) -> tuple[_
         if args.npz:
             size_bytes += VOXEL_BYTES * sum(map(len, cell.history.rows.values()))
             _check_memory(size_bytes)
-            kept.known.append(_voxels(cell, info, occupied_only=False))
+            kept.known.append(_voxels(cell, info, at, occupied_only=False))
         if args.ply or args.picture:
-            kept.occupied.append(_voxels(cell, info, occupied_only=True))
+            kept.occupied.append(_voxels(cell, info, at, occupied_only=True))
             size_bytes += VOXEL_BYTES * len(kept.occupied[-1])
             _check_memory(size_bytes)
     return kept, count
+
+
+def _epoch(args: argparse.Namespace, info: MapInfo) -> Epoch | None:
+    """Last epoch that is read for `--at`; None: all are.
+
+    Raises:
+        ConflictError: kind `not_known`: the map has no epochs.
+    """
+    time_s = seconds_of(args.at)
+    return None if time_s is None else info.layer.epoch_at(time_s)
 
 
 def _check_memory(size_bytes: int) -> None:
@@ -207,8 +225,8 @@ def _check_outputs(*paths: Path | None) -> None:
             raise BadInputError("bad_output", f"cannot write {path}: is {path.absolute().parent} a folder to write in?")
 
 
-def _voxels(cell: DecodedHistory, info: MapInfo, *, occupied_only: bool) -> Voxels:
-    evidence = shown_evidence(cell.history, info.layer, info.sensor_model)
+def _voxels(cell: DecodedHistory, info: MapInfo, at: Epoch | None, *, occupied_only: bool) -> Voxels:
+    evidence = shown_evidence(cell.history, info.layer, info.sensor_model, at=at)
     return voxels_of_evidence(cell.key, evidence, info.geometry, info.sensor_model, occupied_only=occupied_only)
 
 
@@ -240,6 +258,7 @@ def _export_part(api: MapApi, name: str, args: argparse.Namespace) -> None:
     about = {
         **{"box": args.box, "floor_m": args.floor, "ceiling_m": args.ceiling, "p": args.p or 0.0, "depth": args.depth},
         **{"hotter_k": _kelvin(args.hotter), "colder_k": _kelvin(args.colder), "unknown": args.unknown},
+        "at": None if args.at is None else repr(seconds_of(args.at)),
     }
     for form in FORMATS:
         path: Path | None = getattr(args, form)

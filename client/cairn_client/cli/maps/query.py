@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cairn_client.cli.arguments import Subparsers, add_token, say, seconds_of
+from cairn_client.cli.arguments import Subparsers, add_at, add_token, say, seconds_of
 from cairn_client.cli.robot_arguments import box, place
 from cairn_client.folders.map_folder import open_map
 from cairn_map.evidence.channels import ChannelKind
@@ -54,9 +54,7 @@ def add_parser(commands: Subparsers) -> None:
     query = commands.add_parser("query", help=text, description=__doc__)
     query.add_argument("map", metavar="URL|DIR", help="http://HOST:PORT/maps/NAME, cells, a clone, or a robot's state")
     add_token(query)
-    query.add_argument(
-        "--at", metavar="TIME", help="the map as it was at a time of capture (14:05, 2026-11-27T14:05, else UTC); now"
-    )
+    add_at(query)
     query.set_defaults(run=_run)
     questions = query.add_subparsers(required=True, metavar="QUESTION")
 

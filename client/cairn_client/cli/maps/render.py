@@ -3,6 +3,7 @@
     $ cairn map render lab/ --from 1,2,1.4 --to 4,2.5,1 -o view.png
     view.png: temperature, 640 x 480 pixels, 91% of them on the map, 0.3 to 11.2 m away
     $ cairn map render http://127.0.0.1:8750/maps/lab --from 1,2,1.4 --to 4,2.5,1 --layer colour -o view.png
+    $ cairn map render lab/ --from 1,2,1.4 --to 4,2.5,1 --at 14:05 -o then.png       # as it was, in a map with epochs
     $ cairn map render lab/ --over recordings/run1 --scan 12 --camera colour_left -o overlay.png
     overlay.png: temperature over colour_left, scan 12: visible 71%, see-through 22%, map only 3%
 
@@ -29,7 +30,7 @@ from urllib.parse import urlencode
 
 import numpy as np
 
-from cairn_client.cli.arguments import Subparsers, add_token, api_of, say
+from cairn_client.cli.arguments import Subparsers, add_at, add_token, api_of, say, seconds_of
 from cairn_client.cli.robot_arguments import add_spread_arguments, place, spread_of
 from cairn_client.cli.source_arguments import add_source_arguments, asked_source
 from cairn_client.folders.map_folder import FolderMap, map_of_folder
@@ -37,7 +38,7 @@ from cairn_map.errors import BadInputError
 from cairn_map.render.map_picture import arrays_of, layer_picture, layer_values, npz_of
 from cairn_map.render.map_render import MapRenderer
 from cairn_map.render.render_picture import SCALES, Layer, Scale, png_of
-from cairn_map.render.render_request import RenderRequest, request_from
+from cairn_map.render.render_request import NO_AGE_THEN, RenderRequest, request_from
 
 THREADS = 2
 
@@ -72,6 +73,7 @@ def add_parser(commands: Subparsers) -> None:
     render.add_argument("--scan", type=int, default=0, metavar="N", help="number of the scan (0)")
     render.add_argument("--camera", metavar="NAME", help="name of the colour camera (the first)")
     add_spread_arguments(render)
+    add_at(render)
     add_token(render)
     add_source_arguments(render)
     render.set_defaults(run=_run)
@@ -109,7 +111,9 @@ def _check_no_source(args: argparse.Namespace) -> None:
 
 def _folder_map(args: argparse.Namespace) -> FolderMap:
     """The map here; with an age, if that is asked for."""
-    found = map_of_folder(Path(args.map))
+    if args.layer is Layer.AGE and args.at is not None:
+        raise BadInputError("bad_option", f"--layer age: {NO_AGE_THEN}")
+    found = map_of_folder(Path(args.map), at_s=seconds_of(args.at))
     if args.layer is Layer.AGE and found.ages is None:
         raise BadInputError(
             "no_age",
@@ -178,6 +182,8 @@ def _request(args: argparse.Namespace) -> RenderRequest:
     focal_px = width / 2 / float(np.tan(np.radians(args.fov) / 2))
     scale = _scale(args)
     about = {"width": width, "height": height, "focal_px": focal_px, "layer": args.layer, "range_m": args.range}
+    if args.at is not None:
+        about["at"] = repr(seconds_of(args.at))
     if args.covariance is not None:
         about["covariance_lower"] = ",".join(f"{number!r}" for number in args.covariance)
     else:
