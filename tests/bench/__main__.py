@@ -58,9 +58,9 @@ from cairn_map.evidence.fingerprint import fingerprint
 from cairn_map.evidence.grid import CellKey, Geometry, geometry_for
 from cairn_map.wire.messages import CreateMap, Register
 from cairn_sim.robots.heads import full_head
-from cairn_sim.robots.record import Plan, scans_of, shots_of
+from cairn_sim.robots.record import Plan, record, scans_of, shots_of
 from cairn_sim.robots.robots import ROBOTS
-from cairn_sim.scene.scene_file import load_scene
+from cairn_sim.scene.scene_file import load_scene, shipped_text
 
 Row = tuple[str, str, str]
 NAME_WIDTH = 66
@@ -185,23 +185,45 @@ def _server_rows(scans: list[list[Scan]], *, pushes: int) -> Iterator[Row]:
 
 
 def _recording_rows(smoke: bool) -> Iterator[Row]:
+    with tempfile.TemporaryDirectory() as folder:
+        name = "a simulated camera carried at 0.4 m/s, 30 images/s"
+        yield from _replay_rows(name, _carried(Path(folder), smoke), 0.04, (COLOUR,), smoke)
     root = os.environ.get("CAIRN_TEST_DATA")
     if not root:
         return
-    layouts: tuple[tuple[str, float, tuple[Channel, ...]], ...] = (
-        ("apc_shelf_rgbd", 0.01, (COLOUR,)),
-        ("mm5_rgbdt", 0.01, (COLOUR, TEMPERATURE)),
-    )
-    for name, voxel_m, channels in layouts:
+    for name, channels in (("apc_shelf_rgbd", (COLOUR,)), ("mm5_rgbdt", (COLOUR, TEMPERATURE))):
         source = open_source(Path(root) / name)
-        geometry = geometry_for(voxel_edge_m=voxel_m, channels=channels)
-        count = 3 if smoke else len(source)
-        seconds, size_bytes = _replayed(source, geometry, count, Grouping(scans_max=1))
-        yield f"replay {name}, {voxel_m * 100:g} cm", f"{count / seconds:.1f}", "images/s, read, mapped, pushed"
-        yield "  bytes pushed per measurement (1 image)", f"{size_bytes / count:.0f}", "B"
-        grouping = Grouping() if source.has_times else Grouping(seconds_max=None)
-        seconds, size_bytes = _replayed(source, geometry, count, grouping)
-        yield "  bytes pushed per 1000 images, standard groups", f"{size_bytes / count / 1000:.2f}", "MB"
+        yield from _replay_rows(name, source, 0.01, channels, smoke)
+
+
+def _carried(folder: Path, smoke: bool) -> ScanSource:
+    """A hand-held RGB-D camera on its way through the laboratories: 500 images of 320 x 240 pixels."""
+    plan = Plan(
+        scene=load_scene("building"),
+        robot=ROBOTS["handheld"],
+        path="labs",
+        truth="none",
+        scale=0.5,
+        speed_m_s=0.4,
+        rate_hz=30.0,
+        last_stop=3 if smoke else 500,
+    )
+    for _ in record(plan, folder / "carried", scene_text=shipped_text("building")):
+        pass
+    return open_source(folder / "carried")
+
+
+def _replay_rows(
+    name: str, source: ScanSource, voxel_m: float, channels: tuple[Channel, ...], smoke: bool
+) -> Iterator[Row]:
+    geometry = geometry_for(voxel_edge_m=voxel_m, channels=channels)
+    count = 3 if smoke else len(source)
+    seconds, size_bytes = _replayed(source, geometry, count, Grouping(scans_max=1))
+    yield f"replay {name}, {voxel_m * 100:g} cm", f"{count / seconds:.1f}", "images/s, read, mapped, pushed"
+    yield "  bytes pushed per measurement (1 image)", f"{size_bytes / count:.0f}", "B"
+    grouping = Grouping() if source.has_times else Grouping(seconds_max=None)
+    seconds, size_bytes = _replayed(source, geometry, count, grouping)
+    yield "  bytes pushed per 1000 images, standard groups", f"{size_bytes / count / 1000:.2f}", "MB"
 
 
 def _replayed(source: ScanSource, geometry: Geometry, count: int, grouping: Grouping) -> tuple[float, int]:
