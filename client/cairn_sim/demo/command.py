@@ -30,6 +30,8 @@ from rich.table import Table
 from cairn_client.cli.arguments import parser, shown_bytes
 from cairn_client.http.api import MapApi
 from cairn_fusion.view.picture import write_map_picture
+from cairn_map.epochs.epoch import STANDARD_EPOCH_S
+from cairn_map.epochs.present import shown_evidence
 from cairn_map.errors import BadInputError, UnreachableError
 from cairn_map.evidence.grid import geometry_for
 from cairn_map.evidence.inverse_sensor_model import SensorModel
@@ -100,7 +102,7 @@ def main(argv: list[str]) -> int:
     with _server(args.output / "server") as url:
         console.print(f"server on {url}, its data in {args.output / 'server'}")
         api = MapApi(url)
-        api.create_map(MAP, CreateMap(geometry=geometry_for(voxel_edge_m=args.voxel)))
+        api.create_map(MAP, CreateMap(geometry=geometry_for(voxel_edge_m=args.voxel), epoch_s=STANDARD_EPOCH_S))
         scene = load_scene("moving-building")
         map_url = f"{url}/maps/{MAP}"
         chosen = [replace(plan, scans=QUICK_SCANS) if args.quick else plan for plan in plans(scene)]
@@ -198,8 +200,9 @@ def _retract(team: Sequence[DemoRobot], api: MapApi, console: Console) -> None:
 def _write(member: DemoRobot, folder: Path, console: Console) -> None:
     view = member.robot.map
     model = SensorModel()
+    cells = {key: shown_evidence(view.history(key), view.layer, model) for key in view}
     voxels = joined_voxels(
-        [voxels_of_evidence(k, e, view.geometry, model, occupied_only=True) for k, e in view.packed().items()]
+        [voxels_of_evidence(key, cell, view.geometry, model, occupied_only=True) for key, cell in cells.items()]
     )
     (folder / "map.ply").write_bytes(ply_file(voxels))
     write_map_picture(folder / "map.png", voxels, voxel_edge_m=view.geometry.voxel_edge_m, ceiling_m=CEILING_M)

@@ -64,7 +64,15 @@ class DemoRobot:
         self.error: BaseException | None = None
         self._scene = scene
         self._noise = Noise(seed)
-        self.robot = Robot(plan.rig, map_url, directory=folder / plan.name, name=plan.name, mode=plan.mode, stay=True)
+        self.robot = Robot(
+            plan.rig,
+            map_url,
+            directory=folder / plan.name,
+            name=plan.name,
+            mode=plan.mode,
+            stay=True,
+            times="recorded",  # the scene's time is not this machine's
+        )
         self.may_start = threading.Event()
         self._thread = threading.Thread(target=self._run, name=plan.name, daemon=True)
 
