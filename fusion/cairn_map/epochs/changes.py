@@ -4,7 +4,8 @@ A voxel has appeared or gone if all of this holds:
 
     its readings before and after differ                     occupied or not
     G > 10.83                                                 likelihood ratio of hits among observations, p = 0.001,
-    with at least 4 new observations                          at some epoch since then, before and after it
+    with at least 4 new observations                          at some epoch since then: those after it, and those
+                                                              before it since the reading last changed
     at least 4 of the 27 voxels around it changed the same way
 
 In a scene where nothing moved, readings alone differ in hundreds of voxels at each comparison, because poses and ranges
@@ -27,7 +28,7 @@ from cairn_map.epochs.present_kernels import ALONE_MIN
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.grid import CellKey, Geometry, voxels_in_cell
-from cairn_map.evidence.inverse_sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel, log_odds
 
 G_MIN = 10.83
 """Least likelihood ratio: chi-squared of one degree of freedom at p = 0.001."""
@@ -163,7 +164,7 @@ def cell_changes(
     # R3 a to c.
     flipped = np.nonzero(occupied != was)[0]
     is_sure = np.zeros(len(now), np.bool_)
-    is_sure[flipped] = _is_likely(history, now.voxels[flipped], now.counts[flipped], since)
+    is_sure[flipped] = _is_likely(history, now.voxels[flipped], now.counts[flipped], since, model)
     warmth = _warming(before, now, rows, geometry)
 
     def numbers(mask: npt.NDArray[np.bool_]) -> Ints:
@@ -180,28 +181,37 @@ def cell_changes(
 
 
 def _is_likely(
-    history: CellHistory, voxels: npt.NDArray[np.uint32], counts: Ints, since: Epoch
+    history: CellHistory, voxels: npt.NDArray[np.uint32], counts: Ints, since: Epoch, model: SensorModel
 ) -> npt.NDArray[np.bool_]:
-    """(N,) True where the observations after some epoch, not before `since`, differ from all until then.
+    """(N,) True where the observations after some epoch, not before `since`, differ from those until then.
 
-    What changed long after `since` was first seen unchanged: against these observations, too, the new ones count.
+    What changed long after `since` was first seen unchanged: against these observations, too, the new ones count. What
+    came and went was free long before: only observations since the reading last changed say what it was until then.
 
     Args:
         history: the cell's.
         voxels: (N,) rising.
         counts: (N, 2) their hits and misses of all times.
         since: first epoch after which they may have changed.
+        model: inverse sensor model of the reading.
     """
-    found, old = np.zeros(len(voxels), np.bool_), np.zeros_like(counts)
+    found, old, left = np.zeros(len(voxels), np.bool_), np.zeros_like(counts), counts.copy()
+    odds = np.zeros(len(voxels))
+    steps = np.array([log_odds(model.p_hit), log_odds(model.p_miss)])
+    low, high, border = log_odds(model.p_min), log_odds(model.p_max), log_odds(model.p_occupied)
     epochs = list(history)
     for epoch, following in zip(epochs, [*epochs[1:], None], strict=True):
         row = history.rows[epoch]
         at = np.minimum(np.searchsorted(row.voxels, voxels), len(row) - 1)
-        old += np.where((row.voxels[at] == voxels)[:, None], row.counts[at], 0)
+        seen = np.where((row.voxels[at] == voxels)[:, None], row.counts[at], 0)
+        # R1, and whether the reading changes by this row.
+        was_occupied = odds > border
+        odds = np.clip(odds + seen @ steps, low, high)
+        old = np.where(((odds > border) != was_occupied)[:, None], 0, old) + seen
+        left -= seen
         # After this row lies a time at which they may have changed.
         if following is not None and following > since:
-            new = counts - old
-            found |= (likelihood_ratio(old, new) > G_MIN) & (new.sum(axis=1) >= NEW_MIN)
+            found |= (likelihood_ratio(old, left) > G_MIN) & (left.sum(axis=1) >= NEW_MIN)
     return found
 
 

@@ -70,6 +70,13 @@ def test_what_changed_long_after_was_first_seen_as_before() -> None:
     assert as_set(found.gone) == as_set(CRATE)
 
 
+def test_what_stood_for_a_while_where_it_was_free_before_is_gone() -> None:
+    visit = [scans(CRATE, 1, misses=30), *(scans(CRATE, epoch, hits=3) for epoch in (4, 6, 7, 8))]
+    found = changes(*visit, scans(CRATE, 9, misses=15))
+    assert as_set(found.gone) == as_set(CRATE)
+    assert not len(changes(*visit, since=8).gone)
+
+
 def test_a_crate_on_the_floor_has_appeared_down_to_the_floor() -> None:
     floor = np.array([[x, y, 3] for x in range(12) for y in range(4, 12)])
     ground = [scans(floor, epoch, hits=12) for epoch in (1, 9)]
