@@ -253,7 +253,7 @@ def certificate_check(left_s: float) -> Check:
     ends = f"{datetime.fromtimestamp(time.time() + left_s, UTC):%Y-%m-%d %H:%M} UTC"
     found = f"valid for {left_s / DAY_S:.1f} days, until {ends}"
     if left_s < CERTIFICATE_WARN_S:
-        advice = "renew it, and send the server SIGHUP, or its proxy what that takes: from then on no client connects"
+        advice = "renew it in time, and send the server SIGHUP (a proxy has its own way): no client takes an ended one"
         return Check("certificate", CheckResult.WARN, found, advice)
     return Check("certificate", CheckResult.OK, found)
 

@@ -21,8 +21,8 @@ from cairn_server.store.store import Store
 
 log = logging.getLogger(__name__)
 
-OWN_NAMES = frozenset({LOCK_NAME, LIST_NAME, NOTE_NAME, "lost+found"})
-"""Names next to a store, and that of a new file system."""
+OWN_NAMES = frozenset({LOCK_NAME, LIST_NAME, NOTE_NAME, "kernels", "lost+found"})
+"""Names next to a store: compiled kernels come before it; and that of a new file system."""
 NAMED_MAX = 3
 FOLD_CONNECTIONS = 4
 """Connections to the database of the process that plans folds: it has two threads."""

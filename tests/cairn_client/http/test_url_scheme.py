@@ -86,7 +86,7 @@ def test_a_proxy_s_answer_in_plain_words_is_understood(certificate: Path, monkey
         def do_GET(self) -> None:
             self.send_error(400, "Client sent an HTTP request to an HTTPS server.")
 
-        def log_message(self, *arguments: object) -> None:
+        def log_message(self, format: str, *arguments: object) -> None:
             """Nothing."""
 
     monkeypatch.setattr(client_api, "speaks_tls", lambda url: True)

@@ -58,7 +58,7 @@ def back_up(folder: Path, target: Path, report: Report) -> int:
     if not is_free and (target.samefile(source) or _version_of(target) not in range(1, len(STEPS) + 1)):
         raise BadInputError("bad_backup", f"{target} is there and is no backup of this cairn's; choose another name")
     with _partial(target) as partial:
-        _copy(source, partial, report)
+        _copy(source, partial, report, shown=target)
     size_bytes = target.stat().st_size
     note_backup(folder, str(target.absolute()), size_bytes)
     return size_bytes
@@ -106,7 +106,7 @@ def restore(
         if found:
             raise ConflictError("not_empty", f"{folder} is not empty, it has {found[0]}; restore into a new folder")
         with _partial(folder / FILE_NAME) as partial:
-            _copy(source, partial, report)
+            _copy(source, partial, report, shown=folder / FILE_NAME)
             _check_form(partial)
             _migrate(partial)
             verify(partial)
@@ -164,7 +164,13 @@ def _opened(path: Path) -> apsw.Connection:
     return connection
 
 
-def _copy(source: Path, target: Path, report: Report) -> None:
+def _copy(source: Path, target: Path, report: Report, *, shown: Path | None = None) -> None:
+    """Copy one state of a store; `shown` is the target's name in messages.
+
+    Raises:
+        BadInputError: kind `bad_store`: the store cannot be opened; kind `bad_backup`: the target cannot be written.
+        DamagedDataError: kind `damaged_store`: the store cannot be read.
+    """
     try:
         from_store = _opened(source)
     except apsw.Error as exc:
@@ -178,10 +184,9 @@ def _copy(source: Path, target: Path, report: Report) -> None:
                 backup.step(STEP_PAGES)
                 report(backup.page_count - backup.remaining, backup.page_count)
     except apsw.Error as exc:
-        # All others are of the file that is written: `_partial` reports them.
         if isinstance(exc, apsw.CorruptError | apsw.NotADBError) or getattr(exc, "extendedresult", 0) in UNREADABLE:
             raise DamagedDataError("damaged_store", f"{source} cannot be copied: {exc}") from exc
-        raise
+        raise _cannot_write(exc, target, shown or target) from exc
     finally:
         from_store.close()
         to_file.close()
@@ -266,12 +271,16 @@ def _partial(target: Path) -> Iterator[Path]:
         partial.replace(target)
         _sync(target.parent)
     except (OSError, apsw.Error) as exc:
-        why = "its disk is full" if is_full(exc, partial) else exc.strerror if isinstance(exc, OSError) else str(exc)
-        raise BadInputError("bad_backup", f"{target} cannot be written: {why}") from exc
+        raise _cannot_write(exc, partial, target) from exc
     finally:
         for side in SIDES:
             with suppress(OSError):
                 partial.with_name(partial.name + side).unlink(missing_ok=True)
+
+
+def _cannot_write(exc: apsw.Error | OSError, path: Path, shown: Path) -> BadInputError:
+    why = "its disk is full" if is_full(exc, path) else exc.strerror if isinstance(exc, OSError) else str(exc)
+    return BadInputError("bad_backup", f"{shown} cannot be written: {why}")
 
 
 def _sync(path: Path) -> None:
