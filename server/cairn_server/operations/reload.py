@@ -1,6 +1,6 @@
 """Reload: at SIGHUP a server reads its certificate and its secrets again, without a stop.
 
-    admin, enrolment and upstream token    of their files, the settings file and the environment
+    admin, enrolment and upstream token    of their files, and of the settings file
     certificate and key                    of the files that it was started with
 
 What is not good changes nothing, and the log says why. Open connections go on: those of TLS with the certificate that

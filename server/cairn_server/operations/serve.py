@@ -11,6 +11,7 @@ Without a token it trusts every client that reaches it, and therefore only liste
 put a secret of at least 16 characters into a file and name it with --admin-token-file; robots register with the
 secret of --enrolment-token-file. CAIRN_ADMIN_TOKEN and CAIRN_ENROLMENT_TOKEN do the same from the environment.
 `cairn token` gives tokens for less than everything. Beyond a network that you trust, use --tls-cert and --tls-key.
+At SIGHUP it reads its certificate and the files of its tokens again; a file may have several, a line each.
 
     $ cat server.toml
     keep_evidence_s = 604_800
