@@ -83,7 +83,7 @@ MAY_NAME = {
     ],
     "psycopg": ["cairn_server/store/postgres/*.py"],
     "obstore": ["cairn_server/store/objects/bucket.py"],
-    "cryptography": ["cairn_map/commits/signature.py", "cairn_server/access/own_names.py"],
+    "cryptography": ["cairn_map/commits/signature.py", "cairn_server/access/server_certificate.py"],
     "laspy": ["cairn_map/files/laz.py", "cairn_fusion/clouds/cloud_file.py"],
     "lazrs": ["cairn_map/files/laz.py"],
     "small_gicp": ["cairn_client/robot/alignment.py"],

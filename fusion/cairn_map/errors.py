@@ -67,8 +67,14 @@ def first_error(exc: ValidationError) -> str:
     if exc.error_count() > COMPLAINTS_MAX:
         return f"more than {COMPLAINTS_MAX} fields are wrong"
     first = exc.errors(include_url=False, include_context=False, include_input=False)[0]
-    where = ".".join(str(part) for part in first["loc"]) or "document"
-    return f"{where[:200]}: {first['msg'].removeprefix('Value error, ')[:200]}"
+    where = ".".join(str(part) for part in first["loc"])
+    said = complaint_text(first["msg"])[:200]
+    return f"{where[:200]}: {said}" if where else said
+
+
+def complaint_text(message: str) -> str:
+    """A model's complaint without the words that pydantic puts before those of a validator of ours."""
+    return message.removeprefix("Value error, ").removeprefix("Assertion failed, ")
 
 
 def exit_code_of(exc: CairnError) -> int:
@@ -84,7 +90,7 @@ OF_FAMILY: tuple[tuple[type[CairnError], int], ...] = (
     (DamagedDataError, 6),
 )
 EXIT_CODES = (
-    "exit codes: 0 done, 1 refused or impossible as asked, 2 wrong usage, 3 not found, 4 conflict, 5 no link,\n"
-    "  6 damaged data, 130 interrupted; the cause and its [kind] are on standard error"
+    "exit codes: 0 done, 1 refused or impossible as asked, 2 wrong usage, 3 not found, 4 conflict, 5 no link\n"
+    "  or not now, 6 damaged data, 130 interrupted; the cause and its [kind] are on standard error"
 )
 """Last lines of every --help."""

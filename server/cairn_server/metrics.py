@@ -20,7 +20,7 @@ from prometheus_client.registry import Collector
 from cairn_map.wire.empty_cell_frames import EmptyCellFrames
 from cairn_map.wire.frames import CellFrame, Frame
 from cairn_server.processes import used_bytes
-from cairn_server.store.store_rows import Backlog, StoreFigures, UsedPart
+from cairn_server.store.store_rows import Backlog, HeardRobot, StoreFigures, UsedPart
 
 MEDIA_TYPE = CONTENT_TYPE_PLAIN_0_0_4
 SERIES_MAX = 2000
@@ -162,9 +162,39 @@ def store_metrics(found: StoreFigures, backlogs: list[Backlog], at_work: Collect
     yield _gauge_by_map("cairn_pending_oldest_age_seconds", "Age of the oldest of them; 0 without any.", ages_s)
 
 
-def upstream_metrics(ages_s: Mapping[str, float]) -> Iterator[Metric]:
-    """Age of the last complete hand-over of each map to the upstream server."""
-    yield _gauge_by_map("cairn_upstream_age_seconds", "Since all of a map was handed to the upstream server.", ages_s)
+def upstream_metrics(ages_s: Mapping[str, float], ups: Mapping[str, bool]) -> Iterator[Metric]:
+    """Hand-over of each map to the upstream server: its age, and its last outcome."""
+    text = "Since all of a map was handed to the upstream server, or since the start."
+    yield _gauge_by_map("cairn_upstream_age_seconds", text, ages_s)
+    text = "1 if the last round with the upstream server went well: with a map, and without one with the server."
+    yield _gauge_by_map("cairn_upstream_up", text, {name: float(is_up) for name, is_up in ups.items()})
+
+
+def robot_metrics(heard: Iterable[HeardRobot], *, now_s: float) -> Iterator[Metric]:
+    """Time since the last sign of each registered robot."""
+    gauge = GaugeMetricFamily(
+        "cairn_robot_silence_seconds", "Since the last sign of a registered robot.", labels=["map", "robot"]
+    )
+    for each in heard:
+        gauge.add_metric([each.map, each.robot], max(0.0, now_s - each.heard_s))
+    yield gauge
+
+
+def safekeeping_metrics(backup_age_s: float | None, certificate_left_s: float | None) -> Iterator[Metric]:
+    """Age of the last backup and rest of the certificate, which an administrator sees to; None: there is none.
+
+    A store without a backup has one that is infinitely old, so that an alarm on its age holds.
+    """
+    backup = GaugeMetricFamily("cairn_backup_age_seconds", "Since the last `cairn serve backup`; +Inf without any.")
+    if backup_age_s is not None:
+        backup.add_metric([], backup_age_s)
+    yield backup
+    certificate = GaugeMetricFamily(
+        "cairn_certificate_expiry_seconds", "Until the server's certificate ends; below 0 once it has."
+    )
+    if certificate_left_s is not None:
+        certificate.add_metric([], certificate_left_s)
+    yield certificate
 
 
 def _gauge_by_map(name: str, help_text: str, values: Mapping[str, float]) -> GaugeMetricFamily:

@@ -33,7 +33,11 @@ def fork(work: Callable[[Connection], None]) -> tuple[Connection, int]:
             # Ends of the links to other children: a link must end when its owner closes it.
             os.closerange(STANDARD_STREAMS, theirs.fileno())
             os.closerange(theirs.fileno() + 1, os.sysconf("SC_OPEN_MAX"))
-            for number in (signal.SIGINT, signal.SIGTERM):  # sent to the whole group: the server ends first, in order
+            for number in (
+                signal.SIGINT,
+                signal.SIGTERM,
+                signal.SIGHUP,
+            ):  # sent to the whole group: the server ends first, in order
                 signal.signal(number, signal.SIG_IGN)
             work(Connection(theirs.detach()))
         finally:

@@ -15,8 +15,10 @@ import time
 from dataclasses import dataclass
 from itertools import chain
 
+from cairn_server.access.auth import TokenHolders
 from cairn_server.access.cancellation import StopTime
 from cairn_server.access.rate_limits import ActLimit
+from cairn_server.access.server_certificate import certificate_of
 from cairn_server.cell_room import DECODING
 from cairn_server.folding.cells import Cells
 from cairn_server.folding.damaged_cells import DamagedCells
@@ -31,16 +33,20 @@ from cairn_server.live.robot_reports import RobotReports
 from cairn_server.live.site import Site
 from cairn_server.maps import Maps
 from cairn_server.metrics import (
+    SERIES_MAX,
     ServerFigures,
     clock_metrics,
     memory_metrics,
     metrics_text,
     process_metrics,
+    robot_metrics,
+    safekeeping_metrics,
     share_metrics,
     store_metrics,
     upstream_metrics,
 )
 from cairn_server.settings import Settings
+from cairn_server.store.backup_note import backup_age_s
 from cairn_server.store.row_spool import remove_spools
 from cairn_server.store.store import Store
 from cairn_server.store.store_rows import MapRow, UsedPart
@@ -95,6 +101,8 @@ class Service:
         """Start the parts; without `fold_process` the service's own thread folds, if it is to fold at all."""
         self.store = store
         self.settings = settings
+        self.certificate = certificate_of(settings)
+        self.holders = TokenHolders(store, settings)
         self.figures = ServerFigures()
         self._full_authors_now: list[UsedPart] = []
         self._full_authors_until_s = -math.inf
@@ -146,7 +154,7 @@ class Service:
             CellViews(store, self.cells),
             MapViews(store, self.cells, cache_share=settings.memory.cache_share),
             exports,
-            ExportTickets(store, settings, exports),
+            ExportTickets(store, self.holders, exports),
             MapChangesSearch(store, self.cells),
         )
 
@@ -206,12 +214,17 @@ class Service:
         """All metrics for Prometheus."""
         health = self.store.health
         store = store_metrics(health.figures(), health.backlogs(), self.figures.maps_at_work())
-        upstream = upstream_metrics(self.sync.upstream.ages_s())
+        now_s, names = time.time(), [row.name for row in self.store.maps()[:SERIES_MAX]]
+        upstream = upstream_metrics(self.sync.upstream.ages_s(names), self.sync.upstream.ups(names))
+        robots = robot_metrics(self.store.notes.heard(limit=SERIES_MAX), now_s=now_s)
+        # A database is copied by its own tools, which leave no note here.
+        backup_s = backup_age_s(self.settings.folder, now_s=now_s) if self.settings.store is None else None
+        kept = safekeeping_metrics(backup_s, self.certificate.ends_s - now_s if self.certificate is not None else None)
         shares = share_metrics([*self.store.shares.full_sums(), *self._full_authors()])
         memory = memory_metrics(self.settings.memory.limit_bytes)
         clock = clock_metrics(self.clock.doubt_s())
         counted = self.figures.registry.collect()
-        return metrics_text(chain(counted, store, shares, upstream, memory, clock, process_metrics()))
+        return metrics_text(chain(counted, store, shares, upstream, robots, kept, memory, clock, process_metrics()))
 
     def stop_streams(self) -> None:
         """Count as not ready and end live streams, which never end alone; requests are still answered for a while."""

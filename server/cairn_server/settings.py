@@ -49,7 +49,19 @@ def _origins(value: str) -> str:
 
 Count = Annotated[Annotated[int, Field(ge=1)] | None, BeforeValidator(_none_if_zero)]
 Metres = Annotated[Annotated[float, Field(gt=0)] | None, BeforeValidator(_none_if_zero)]
-Token = Annotated[str, Field(min_length=16)]
+SECRET_LENGTH_MIN = 16
+"""Characters that a secret has at least."""
+
+
+def _secrets(value: str) -> str:
+    secrets = value.split("\n")
+    if not all(len(secret.strip()) >= SECRET_LENGTH_MIN for secret in secrets):
+        raise ValueError(f"expected a secret of at least {SECRET_LENGTH_MIN} characters on each line")
+    return "\n".join(secret.strip() for secret in secrets)
+
+
+Secrets = Annotated[str, AfterValidator(_secrets)]
+"""One secret, or several on lines of their own, all of which count: while one takes the place of another."""
 
 
 class Quotas(BaseModel):
@@ -109,10 +121,12 @@ class Settings(BaseModel):
     """Address to listen on."""
     port: Annotated[int, Field(ge=0, le=65535)] = 8750
     """Port to listen on, 0 for any free one."""
-    admin_token: Token | None = None
-    """Secret whose bearer may do everything; without it any client is trusted, and only loopback is listened on."""
-    enrolment_token: Token | None = None
-    """Secret whose bearer may register robots; without it only the admin token may."""
+    admin_token: Secrets | None = None
+    """Secret whose bearer may do everything; without it any client is trusted, and only loopback is listened on. Of
+    several, a line each, all count."""
+    enrolment_token: Secrets | None = None
+    """Secret whose bearer may register robots; without it only the admin token may. Of several, a line each, all
+    count."""
     tls_cert: Path | None = None
     """Certificate chain, PEM: with it and its key the server speaks https only."""
     tls_key: Path | None = None
@@ -188,6 +202,16 @@ class Settings(BaseModel):
         )
 
     @property
+    def admin_tokens(self) -> list[str]:
+        """Secrets whose bearer may do everything; empty: any client is trusted."""
+        return self.admin_token.split("\n") if self.admin_token is not None else []
+
+    @property
+    def enrolment_tokens(self) -> list[str]:
+        """Secrets whose bearer may register robots."""
+        return self.enrolment_token.split("\n") if self.enrolment_token is not None else []
+
+    @property
     def place(self) -> str:
         """Place of the maps, for people: without a password."""
         if self.store is None:
@@ -230,7 +254,8 @@ class Settings(BaseModel):
             BadInputError: kind `open_server`: the host is not loopback and there is no admin token. Kind
                 `weak_tokens`: an enrolment token without an admin token, or equal to it.
         """
-        if self.enrolment_token is not None and self.admin_token in (None, self.enrolment_token):
+        shared = set(self.admin_tokens) & set(self.enrolment_tokens)
+        if shared or (self.enrolment_tokens and not self.admin_tokens):
             raise BadInputError(
                 "weak_tokens",
                 "an enrolment token needs a different admin token (--admin-token-file): without one any client may do "

@@ -1,6 +1,7 @@
 """`GET /metrics`: what is counted, and that it is the format that Prometheus reads."""
 
 import json
+import math
 import re
 import time
 from collections.abc import Iterator
@@ -8,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from prometheus_client import CollectorRegistry, Counter, Histogram
+from tests.fixtures.server.access import register
 from tests.fixtures.server.epoch_contract import cell_of, fold_by_hand
 from tests.fixtures.server.live import Live, until
 from tests.fixtures.server.prometheus_text import families_of, value
@@ -17,6 +19,7 @@ from tests.fixtures.server.pushes import KEYS, MOLE, pushed
 from cairn_server import metrics
 from cairn_server.folding import fold_thread, group_folding
 from cairn_server.metrics import Bounded, metrics_text
+from cairn_server.store.backup_note import NOTE_NAME, note_backup
 
 PUSH = "/maps/{name}/commits/{commit}"
 
@@ -122,6 +125,19 @@ def test_the_store_and_the_process_show_their_sizes(live: Live) -> None:
     for name in ("cairn_store_size_bytes", "cairn_wal_size_bytes", "cairn_disk_free_bytes", "process_open_fds"):
         assert value(text, name) > 0
     assert value(text, "cairn_writer_failures_total", kind="disk_full") == 0
+
+
+def test_a_robot_that_is_silent_shows_and_so_does_a_store_without_a_backup(fresh: Live, tmp_path: Path) -> None:
+    row = fresh.new_map()
+    register(fresh, row)
+    text = text_of(fresh)
+    assert 0 <= value(text, "cairn_robot_silence_seconds", map=row.name, robot="mole") < 20
+    assert value(text, "cairn_backup_age_seconds") == math.inf
+    assert families_of(text)["cairn_certificate_expiry_seconds"].samples == {}
+    note_backup(tmp_path, "/backup/nightly.cairn", 1000)
+    assert 0 <= value(text_of(fresh), "cairn_backup_age_seconds") < 20
+    (tmp_path / NOTE_NAME).write_text('{"time_s": ')  # as a power cut leaves it
+    assert value(text_of(fresh), "cairn_backup_age_seconds") == math.inf
 
 
 def test_names_that_strangers_try_make_no_series(tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from cairn_server.store.store_rows import (
     CellRow,
     ClosedRobot,
     EntrySize,
+    HeardRobot,
     MapRow,
     Robot,
     RobotShares,
@@ -146,6 +147,16 @@ class MemoryNotes:
         """The last status of each branch that ever told one."""
         with self._maps.reading(row) as state:
             return dict(state.statuses)
+
+    def heard(self, *, limit: int) -> list[HeardRobot]:
+        """Robots of all maps by their last signs, the newest first."""
+        with self._maps.locked() as maps:
+            found = [
+                HeardRobot(name, branch.name, branch.last_seen_s)
+                for name, state in maps.items()
+                for branch in state.branches.values()
+            ]
+        return sorted(found, key=lambda each: (-each.heard_s, each.map, each.robot))[:limit]
 
     def entry_sizes(self, row: MapRow, *, after_seq: int, limit: int) -> list[EntrySize]:
         """Log entries after one, oldest first, at most `limit`."""

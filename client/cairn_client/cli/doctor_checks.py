@@ -3,6 +3,7 @@
 Each check has a result, what was found, and the next step where one is needed.
 """
 
+import json
 import platform
 import shutil
 import statistics
@@ -10,6 +11,7 @@ import sys
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
 from enum import StrEnum
 from importlib.metadata import PackageNotFoundError, entry_points, version
@@ -27,6 +29,9 @@ from cairn_map.kernels.numba_runtime import is_compiled, known_kernels
 
 PINGS = 5
 LATENCY_WARN_S = 1.0
+DAY_S = 86_400.0
+CERTIFICATE_WARN_S = 14 * DAY_S
+"""Two weeks: Let's Encrypt's clients renew at a month."""
 CLOCK_WARN_S, CLOCK_FAIL_S = 5.0, 3600.0
 """Seconds between the clocks. A robot's clock dates its scans; an hour off is another time zone, or no clock at all."""
 DATE_ERROR_S = 1.0
@@ -182,7 +187,9 @@ def server_checks(server_url: str, map_name: str | None, *, token: str | None) -
         try:
             waits_s, offset_s = _pings(api)
         except UnreachableError as exc:
-            yield Check("server", CheckResult.FAIL, exc.message, "start it, or look at the network between")
+            is_there = exc.kind == "other_scheme"
+            advice = "give that URL" if is_there else "start it, or look at the network between"
+            yield Check("server", CheckResult.FAIL, exc.message, advice)
             return
         except CairnError as exc:
             advice = "update the older of the two" if exc.kind == "unknown_protocol" else "is this a cairn server?"
@@ -191,6 +198,8 @@ def server_checks(server_url: str, map_name: str | None, *, token: str | None) -
         yield _latency(waits_s)
         yield Check("protocol", CheckResult.OK, f"version {PROTOCOL_VERSION}, here and there")
         yield clock_check(offset_s, max(waits_s))
+        if api.sockets.certificate_end_s is not None:
+            yield certificate_check(api.sockets.certificate_end_s - time.time())
         yield _ready(api)
         allowed = _token(api, map_name)
         yield allowed
@@ -239,14 +248,36 @@ def clock_check(offset_s: float | None, wait_s: float) -> Check:
     return Check("clock", CheckResult.OK, found)
 
 
+def certificate_check(left_s: float) -> Check:
+    """Check of the time for which the server's certificate is still valid."""
+    ends = f"{datetime.fromtimestamp(time.time() + left_s, UTC):%Y-%m-%d %H:%M} UTC"
+    found = f"valid for {left_s / DAY_S:.1f} days, until {ends}"
+    if left_s < CERTIFICATE_WARN_S:
+        advice = "renew it in time, and send the server SIGHUP (a proxy has its own way): no client takes an ended one"
+        return Check("certificate", CheckResult.WARN, found, advice)
+    return Check("certificate", CheckResult.OK, found)
+
+
 def _ready(api: MapApi) -> Check:
     try:
-        api.probe("/readyz")
+        answer = api.probe("/readyz")
     except CairnError as exc:
         return Check(
             "ready", CheckResult.FAIL, f"{exc.message} [{exc.kind}]", "see the server's log; docs/administrator.md"
         )
+    # A clock that is not trusted has a check of its own.
+    ills = [ill for ill in _degraded(answer.body) if not ill.startswith("clock_")]
+    if ills:
+        return Check("ready", CheckResult.WARN, f"takes pushes; {'; '.join(ills)}", "see the server's log")
     return Check("ready", CheckResult.OK, "takes pushes and folds them")
+
+
+def _degraded(body: bytes) -> list[str]:
+    """Complaints of a server that is ready all the same, each as `code: what`."""
+    try:
+        return [str(ill) for ill in str(json.loads(body).get("degraded") or "").split("; ") if ill]
+    except (ValueError, AttributeError):
+        return []
 
 
 def _token(api: MapApi, map_name: str | None) -> Check:

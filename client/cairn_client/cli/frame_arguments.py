@@ -9,7 +9,7 @@ from cairn_client.cli.arguments import say
 from cairn_client.cli.pose_arguments import add_convention_arguments
 from cairn_fusion.recording.frame_folder import FrameFolderOptions, image_patterns
 from cairn_fusion.recording.recording_format import Convention
-from cairn_map.errors import BadInputError
+from cairn_map.errors import BadInputError, complaint_text
 
 TEXT = """Any folder with one file per frame and image: give --depth, --pose, --intrinsics, and options of other images.
 Patterns are relative to the folder and hold {id}, e.g. --depth 'frames/{id}.depth.png' --pose 'frames/{id}.pose.txt'.
@@ -75,7 +75,7 @@ def frame_options(args: argparse.Namespace, folder: Path) -> FrameFolderOptions 
     except ValidationError as exc:
         first = exc.errors()[0]
         where = f"--{first['loc'][0]}" if first["loc"] else "a folder of frames"
-        what = "is missing" if first["type"] == "missing" else first["msg"]
+        what = "is missing" if first["type"] == "missing" else complaint_text(first["msg"])
         raise BadInputError("bad_option", f"{where}: {what}; see `cairn robot replay --help`") from exc
 
 

@@ -20,6 +20,7 @@ from pydantic import TypeAdapter, ValidationError
 from cairn_client.http.answer_reading import CODING, body_of_error, header_text, parts_of, sent_again, time_sample
 from cairn_client.http.origin_tokens import without_token
 from cairn_client.http.request_deadline import PACE, Pace, RequestDeadline
+from cairn_client.http.url_scheme import certificate_end_s, other_scheme, speaks_tls, unreachable
 from cairn_client.sync.requests import Box, GetUpload, PutPart
 from cairn_client.sync.responses import (
     Answer,
@@ -29,7 +30,6 @@ from cairn_client.sync.responses import (
     error_of,
     list_of,
     narrower,
-    unreachable,
 )
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.cursor import cursor_from_text
@@ -117,6 +117,8 @@ class OpenSockets:
         self._lock = threading.Lock()
         self._sockets: weakref.WeakSet[socket.socket] = weakref.WeakSet()
         self._is_cut = False
+        self.certificate_end_s: float | None = None
+        """End of the certificate that the server showed last, UTC seconds since 1970; None: it showed none."""
 
     def watch(self, request: Any) -> None:
         """Note the connection that a request makes, if it makes one.
@@ -147,6 +149,7 @@ class OpenSockets:
     def _trace(self, name: str, info: Mapping[str, Any]) -> None:
         if name in OPENED:
             found = info["return_value"].get_extra_info("socket")
+            self.certificate_end_s = certificate_end_s(found)
             with self._lock:
                 if isinstance(found, socket.socket):
                     self._sockets.add(found)
@@ -178,6 +181,7 @@ class MapApi:
         """The best that the server's answers said of its time since that was taken."""
         self.traffic = Traffic()
         self.sockets = OpenSockets()
+        self._was_answered = False
         self._vector = EMPTY
         """The version vector that came whole last: many cells come with the same one."""
         if not server_url.startswith(("http://", "https://")) or "/maps/" in server_url:
@@ -460,6 +464,15 @@ class MapApi:
                 body += part
             return Answer(response.status_code, response.headers, bytes(body))
 
+    @property
+    def _shown_url(self) -> str:
+        """The server's URL in messages."""
+        return str(self._client.base_url.copy_with(path="/"))
+
+    def _is_for_tls(self) -> bool:
+        """True if this client speaks http where https is spoken."""
+        return self.origin.startswith("http:") and speaks_tls(self.origin)
+
     def _lacks_token(self, error: CairnError) -> bool:
         """True if the server wants a token, and this client has none for it."""
         return self.token is None and error.kind == "no_token"
@@ -495,17 +508,24 @@ class MapApi:
                 self._client.stream(method, path, headers=sent, content=content, params=params) as response,
             ):
                 self.traffic.up_bytes += len(content)
+                was_answered, self._was_answered = self._was_answered, True
                 if method not in CACHED:
                     found = time_sample(response.headers, asked_s=asked_s, answered_s=self._steady_s())
                     self._time = narrower(self._time, found)
                 if not response.is_success and response.status_code != NOT_MODIFIED:
                     retry_after = response.headers.get("Retry-After", "")
                     error = error_of(response.status_code, retry_after, body_of_error(response))
+                    # A proxy's answer in plain words to what its port of https does not take.
+                    if error.kind == "http" and not was_answered and self._is_for_tls():
+                        raise other_scheme(self._shown_url)
                     raise without_token(self.origin, error.message) if self._lacks_token(error) else error
                 yield response, deadline
         except httpx.TransportError as exc:
             deadline.check()
-            raise unreachable(exc) from exc
+            is_connected = not isinstance(exc, httpx.ConnectError | httpx.TimeoutException)
+            if is_connected and not self._was_answered and self._is_for_tls():
+                raise other_scheme(self._shown_url) from exc
+            raise unreachable(exc, self._shown_url) from exc
 
 
 def _vector_of(text: bytes | str) -> VersionVector:

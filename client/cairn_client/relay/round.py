@@ -127,6 +127,10 @@ class Undelivered:
         """True if this side wants no more for now."""
         return self._pauses_until_s.get(to, float("-inf")) > self.clock_s()
 
+    def is_refused(self, to: RelaySide) -> bool:
+        """True if this side refused commits that it lacks."""
+        return bool(self._found[to, Why.REFUSED].intervals)
+
     def may_come_later(self, to: RelaySide) -> bool:
         """True if this side lacks commits that it might take once the link or the server is better."""
         return self.pauses(to) or any(self._found[to, why].intervals for why in (Why.EARLY, Why.BROKEN))

@@ -12,8 +12,8 @@ import time
 from cairn_client.http.backoff import Backoff
 from cairn_client.http.request_deadline import PACE, Pace
 from cairn_client.relay.link import RelayApi, ServerEnd, hold_between
-from cairn_client.relay.round import RelayReport, Undelivered, log_report, relay_round
-from cairn_map.errors import CairnError, UnreachableError
+from cairn_client.relay.round import RelayReport, RelaySide, Undelivered, log_report, relay_round
+from cairn_map.errors import CairnError, DeniedError, NotFoundError, UnreachableError
 from cairn_map.wire.messages import MapInfo
 from cairn_map.wire.relay_peer import TOO_MANY_MAPS, OwnServer
 
@@ -54,6 +54,10 @@ class Upstream:
         """Do a round soon: there is something new here."""
         self._woken.set()
 
+    def use_token(self, token: str | None) -> None:
+        """Show the upstream server this token from now on."""
+        self._api.use_token(token)
+
     def stop(self) -> None:
         """End soon, in the middle of a round if the link is slow: what was not handed over will be."""
         self._stopping.set()
@@ -69,12 +73,16 @@ class Upstream:
             try:
                 has_more = self._round()
             except UnreachableError as exc:
-                self._say(logging.WARNING, f"no link to upstream {self._url}, going on alone: {exc.message}")
+                self._server.note_round(None, exc)
+                what = "no link to" if exc.kind == "no_link" else f"nothing taken now ({exc.kind}) by"
+                self._say(logging.WARNING, f"{what} upstream {self._url}, going on alone: {exc.message}")
                 self._stopping.wait(backoff.next_s(exc.retry_after_s))
             except CairnError as exc:
+                self._server.note_round(None, exc)
                 self._say(logging.ERROR, f"upstream {self._url}: {exc.kind}: {exc.message}")
                 self._stopping.wait(backoff.next_s(None))
-            except Exception:
+            except Exception as exc:
+                self._server.note_round(None, CairnError("internal", type(exc).__name__))
                 log.exception("upstream %s: the relay failed, and tries again", self._url)
                 self._stopping.wait(backoff.next_s(None))
             else:
@@ -89,8 +97,10 @@ class Upstream:
             UnreachableError: the link broke, or a request ran out of time.
         """
         found = sorted(self._api.maps(), key=lambda info: (info.name <= self._last_name, info.name))
+        self._server.note_round(None, None)
         own = set(self._server.map_names())
         for name in sorted(own - {info.name for info in found}):
+            self._server.note_round(name, NotFoundError("no_map", "the upstream server has no such map for this token"))
             self._say(logging.WARNING, f"upstream {self._url} has no map {name} for this token; create it there")
         has_more, cut, is_full = False, None, False
         refused: list[tuple[str, CairnError]] = []
@@ -105,6 +115,7 @@ class Upstream:
                 cut = exc
                 break
             except CairnError as exc:
+                self._server.note_round(info.name, exc)
                 refused.append((info.name, exc))
                 is_full |= exc.kind == TOO_MANY_MAPS
                 continue
@@ -124,8 +135,13 @@ class Upstream:
         self._last_name = info.name
         begun_s = self._server.clock_s()
         resting = self._resting.setdefault(info.name, Undelivered())
+        was_refused = resting.is_refused(RelaySide.THERE)
         report = hold_between(relay_round(resting), here, ServerEnd(self._api, info.name))
         log_report(report, info.name, there=self._url)
+        # A refused commit rests between two tries, and is refused meanwhile.
+        is_refused = was_refused or resting.is_refused(RelaySide.THERE)
+        ill = DeniedError("not_taken", "the upstream server refuses commits of this map") if is_refused else report.cut
+        self._server.note_round(info.name, ill)
         if report.is_all_there:
             self._server.handed_over(info.name, begun_s)
         return report

@@ -89,7 +89,8 @@ class SyncThread:
                 self._sync()
             except UnreachableError as exc:
                 wait_s = backoff.next_s(exc.retry_after_s)
-                log.info("no link (%s); trying again in %.1f s", exc.message, wait_s)
+                what = "no link" if exc.kind == "no_link" else f"the server takes nothing now: {exc.kind}"
+                log.info("%s (%s); trying again in %.1f s", what, exc.message, wait_s)
                 self._wait(exc, wait_s)
             except CairnError as exc:
                 wait_s = backoff.next_s(None)

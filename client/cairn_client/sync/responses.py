@@ -3,7 +3,7 @@
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated
 from unicodedata import category
 
 from pydantic import FailFast, TypeAdapter, ValidationError
@@ -126,16 +126,3 @@ def shown_text(text: str) -> str:
 def one_line(text: str) -> str:
     """A text of another program as a part of a line: it cannot look like lines of the command's own."""
     return shown_text(BREAKS.sub(" ", text))
-
-
-def unreachable(exc: Any) -> UnreachableError:
-    """The `UnreachableError` of a request that failed by httpx's `TransportError`."""
-    try:
-        where = str(exc.request.url.copy_with(path="/", query=None))
-    except RuntimeError:
-        where = "the server"
-    if "CERTIFICATE_VERIFY_FAILED" in str(exc):
-        return UnreachableError(
-            "no_link", f"{where} shows a certificate of an unknown issuer; name the issuer's file in SSL_CERT_FILE"
-        )
-    return UnreachableError("no_link", f"cannot reach {where} ({exc or type(exc).__name__}); is `cairn serve` running?")

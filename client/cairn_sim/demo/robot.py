@@ -132,8 +132,8 @@ class DemoRobot:
         self.progress.state = "maps"
         try:
             self.sync()
-        except UnreachableError:
-            self.progress.state = "no link"
+        except UnreachableError as exc:
+            self.progress.state = exc.kind.replace("_", " ")
             time.sleep(0.1)
 
     def _note(self) -> None:

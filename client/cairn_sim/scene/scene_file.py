@@ -85,7 +85,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from cairn_calib.rig.poses import Transform
-from cairn_map.errors import COMPLAINTS_MAX, BadInputError
+from cairn_map.errors import COMPLAINTS_MAX, BadInputError, complaint_text
 from cairn_sim.scene.movements import Keyframe, Movement, MovingObject
 from cairn_sim.scene.scene import SOLIDS_MAX, Scene, scene_of
 from cairn_sim.scene.scene_format import (
@@ -389,7 +389,7 @@ def _complaint(exc: ValidationError) -> str:
         return f"more than {COMPLAINTS_MAX} fields are wrong"
     first = exc.errors(include_url=False, include_context=False)[0]
     where = ".".join(str(part) for part in first["loc"]) or "document"
-    what = first["msg"].removeprefix("Value error, ")
+    what = complaint_text(first["msg"])
     came = first["input"]
     # A table's or a list's text may be as long as the file, and as deep.
     said = repr(came)[:CAME_MAX] if isinstance(came, str | bool | int | float) else f"a {type(came).__name__}"

@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from cairn_map.commits.ids import Author, CommitId, author_from_text, commit_id_from_text
 from cairn_map.commits.version_vector import AUTHORS_MAX, VersionVector, version_vector_from_json
+from cairn_map.errors import CairnError
 from cairn_map.wire.messages import WANTED_MAX, IdText, MapInfo, VectorJson
 
 SumText = Annotated[str, Field(pattern=r"^[0-9a-f]{32}$")]
@@ -100,6 +101,10 @@ class OwnServer(Protocol):
 
     def handed_over(self, map_name: str, begun_s: float) -> None:
         """Note that all signed commits of a map at a time (`clock_s`) were handed to the upstream."""
+        ...
+
+    def note_round(self, map_name: str | None, ill: CairnError | None) -> None:
+        """Note how a round with a map, or (None) with the upstream server as a whole, went; `ill` is None if well."""
         ...
 
 

@@ -90,28 +90,65 @@ def token_hash(token: str) -> bytes:
     return hashlib.sha256(token.encode()).digest()
 
 
-def caller_of(token: str | None, row: MapRow | None, store: Store, settings: Settings) -> Caller:
-    """Caller that shows this token, on a map or (None) on the server as a whole.
+class TokenHolders:
+    """Callers by the tokens that they show: those of the store, and the secrets of the settings.
 
-    Raises:
-        DeniedError: kind `no_token`, `bad_token`, also on a map that the token is not for, or `unconfirmed_token`.
+    The secrets may be replaced while the server runs, by any thread: each request is judged by those of its moment.
     """
-    return caller_of_hash(None if token is None else token_hash(token), row, store, settings)
+
+    def __init__(self, store: Store, settings: Settings) -> None:
+        self._store = store
+        self._settings = settings
+        self._secrets = _callers_of_secrets(settings)
+
+    def use_secrets(self, settings: Settings) -> None:
+        """Take the secrets of these settings from now on, and no others; they have an admin's if there was one."""
+        self._secrets = _callers_of_secrets(settings)
+
+    def of(self, token: str | None, row: MapRow | None) -> Caller:
+        """Caller that shows this token, on a map or (None) on the server as a whole.
+
+        Raises:
+            DeniedError: kind `no_token`, `bad_token`, also on a map that the token is not for, or `unconfirmed_token`.
+        """
+        return self.of_hash(None if token is None else token_hash(token), row)
+
+    def of_hash(self, secret_hash: bytes | None, row: MapRow | None) -> Caller:
+        """Caller that showed a token of this SHA-256; as `of`."""
+        if secret_hash is None:
+            if not self._secrets:
+                return Caller(Role.ADMIN, name=LOCAL)
+            raise DeniedError(
+                "no_token",
+                "this server wants a token: Authorization: Bearer TOKEN (the cairn command: --token, CAIRN_TOKEN)",
+            )
+        caller = self._holder(secret_hash)
+        if caller is None or not (row is None or caller.counts_on(row.number)):
+            raise bad_token()
+        return caller
+
+    def _holder(self, secret_hash: bytes) -> Caller | None:
+        store = self._store
+        known = store.tokens.of_hash(secret_hash)
+        if known is None:
+            same = (who for own, who in self._secrets if hmac.compare_digest(secret_hash, own))
+            return next(same, None)
+        if has_ended(known, self._settings, now_s=time.time(), age_s=store.age.now_s()):
+            return None
+        if not known.is_confirmed:
+            raise DeniedError(
+                "unconfirmed_token",
+                f"the server was restored from a backup, and the token {known.name} is off until an admin says that it "
+                f"was not ended meanwhile: cairn token confirm SERVER {known.name}",
+            )
+        store.tokens.used(known.name)
+        return Caller(Role(known.role), known.robot, known.name, known.map_number)
 
 
-def caller_of_hash(secret_hash: bytes | None, row: MapRow | None, store: Store, settings: Settings) -> Caller:
-    """Caller that showed a token of this SHA-256; as `caller_of`."""
-    if secret_hash is None:
-        if settings.admin_token is None:
-            return Caller(Role.ADMIN, name=LOCAL)
-        raise DeniedError(
-            "no_token",
-            "this server wants a token: Authorization: Bearer TOKEN (the cairn command: --token, CAIRN_TOKEN)",
-        )
-    caller = _holder(secret_hash, store, settings)
-    if caller is None or not (row is None or caller.counts_on(row.number)):
-        raise bad_token()
-    return caller
+def _callers_of_secrets(settings: Settings) -> tuple[tuple[bytes, Caller], ...]:
+    """SHA-256 of each secret of the settings, and who shows it; empty if any client is trusted."""
+    admins = ((token_hash(secret), ADMIN_FILE) for secret in settings.admin_tokens)
+    return (*admins, *((token_hash(secret), ENROLLER_FILE) for secret in settings.enrolment_tokens))
 
 
 def bad_token() -> DeniedError:
@@ -156,27 +193,3 @@ def has_ended(token: Token, settings: Settings, *, now_s: float, age_s: float) -
     if token.role != "robot" or settings.branch_expiry_s is None:
         return False
     return age_s >= max(token.created_age_s, token.used_age_s) + settings.branch_expiry_s
-
-
-def _holder(secret_hash: bytes, store: Store, settings: Settings) -> Caller | None:
-    known = store.tokens.of_hash(secret_hash)
-    if known is not None:
-        if has_ended(known, settings, now_s=time.time(), age_s=store.age.now_s()):
-            return None
-        if not known.is_confirmed:
-            raise DeniedError(
-                "unconfirmed_token",
-                f"the server was restored from a backup, and the token {known.name} is off until an admin says that it "
-                f"was not ended meanwhile: cairn token confirm SERVER {known.name}",
-            )
-        store.tokens.used(known.name)
-        return Caller(Role(known.role), known.robot, known.name, known.map_number)
-    if _is(secret_hash, settings.admin_token):
-        return ADMIN_FILE
-    if _is(secret_hash, settings.enrolment_token):
-        return ENROLLER_FILE
-    return None
-
-
-def _is(secret_hash: bytes, expected: str | None) -> bool:
-    return expected is not None and hmac.compare_digest(secret_hash, token_hash(expected))

@@ -17,6 +17,9 @@ from cairn_server.store.store import StoreHealth
 KEEP_S = 1.0
 """Lifetime of an answer: any client may ask, and each look writes to the disk."""
 
+REOPEN_FACTOR = 1.25
+"""Room, in parts of `disk_free_min_bytes`, from which on a server whose disk was full is ready again: pushes and folds
+move the free space by a cell's size or two, and a server at the bound would come and go with each."""
 OF_ONE_MAP = DamagedDataError, AwayError
 """Errors of folding for which some commits of a map wait, while all else goes on."""
 
@@ -82,6 +85,8 @@ class Readiness:
         self._looked_s = float("-inf")
         self._reasons: list[str] = []
         self._is_closing = False
+        self._is_short = False
+        """True from the moment at which the disk had too little room until it has clearly enough."""
 
     @property
     def is_closing(self) -> bool:
@@ -115,7 +120,7 @@ class Readiness:
     def _look(self) -> list[str]:
         found: list[str] = []
         try:
-            self._store.check_space(self._settings.disk_free_min_bytes)
+            self._check_space()
             self._store.probe()
             found += self._lag()
         except UnreachableError as exc:
@@ -126,6 +131,19 @@ class Readiness:
         if complaint:
             found.append(f"fold_failing: {complaint}")
         return found
+
+    def _check_space(self) -> None:
+        """Return if there is room, and clearly so if there was none at the last look; raises as the store."""
+        least_bytes = self._settings.disk_free_min_bytes
+        was_short, self._is_short = self._is_short, True
+        self._store.check_space(least_bytes)
+        if was_short:
+            try:
+                self._store.check_space(int(REOPEN_FACTOR * least_bytes))
+            except UnreachableError as exc:
+                text = f"pushes are taken again; ready with {REOPEN_FACTOR:g} times disk_free_min_bytes free"
+                raise UnreachableError(exc.kind, text, exc.retry_after_s) from exc
+        self._is_short = False
 
     def _lag(self) -> list[str]:
         limit_s, held_up = self._settings.fold_lag_max_s, self._folds.held_up()

@@ -12,7 +12,13 @@ from cairn_server.access.own_names import OwnNames
 from cairn_server.access.turns import Turns
 from cairn_server.http.middleware.body_limit import BodyLimit, turns_of_long_bodies
 from cairn_server.http.middleware.connection_shares import ConnectionShares
-from cairn_server.http.middleware.head_checks import DeniedHandshakes, PlainPath, ProtocolVersion, SameOrigin
+from cairn_server.http.middleware.head_checks import (
+    DeniedHandshakes,
+    HeadRequests,
+    PlainPath,
+    ProtocolVersion,
+    SameOrigin,
+)
 from cairn_server.http.middleware.request_trail import RequestTrail
 from cairn_server.http.middleware.token_first import TokenFirst
 from cairn_server.http.middleware.work_turns import Lanes, WorkTurns
@@ -62,7 +68,7 @@ def make_app(service: Service, *, long_bodies: LongBodies | None = None) -> Fast
     settings = service.settings
     lanes, bodies = Lanes(), BodyBudget(settings.memory.bodies_bytes)
     reading = turns_of_long_bodies()
-    own_names = OwnNames.of(settings)
+    own_names = OwnNames.of(settings, service.certificate)
     places = ConnectionPlaces(settings.limit_concurrency, trusted_proxies=settings.trusted_proxies)
     app = DocumentedApp(
         title="cairn map server",
@@ -104,3 +110,4 @@ def _middleware(
     yield Middleware(ConnectionShares, places=places)
     yield Middleware(BodyLimit, budget=bodies, turns=reading)
     yield Middleware(WorkTurns, lanes=lanes, stop=service.stop_time)
+    yield Middleware(HeadRequests)

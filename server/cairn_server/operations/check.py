@@ -27,7 +27,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from cairn_map.errors import EXIT_CODES, BadInputError, DamagedDataError
+from cairn_map.errors import EXIT_CODES, BadInputError, DamagedDataError, NotFoundError
 from cairn_map.progress import PercentLine
 from cairn_server.folding.store_check import Finding, check_map
 from cairn_server.operations.bucket_owner import bucket_complaints, settings_of_database
@@ -52,6 +52,8 @@ def main(argv: list[str]) -> int:
     if args.store is not None:
         return _check_database(args.store, args.objects, is_repair=args.repair)
     if args.repair:
+        if not (args.data / FILE_NAME).is_file():
+            raise NotFoundError("no_store", f"there is no store {args.data / FILE_NAME}")
         store = SqliteStore(args.data)
         try:
             outcome = check_all(store, _complaints(args.data))

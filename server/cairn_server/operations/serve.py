@@ -11,6 +11,7 @@ Without a token it trusts every client that reaches it, and therefore only liste
 put a secret of at least 16 characters into a file and name it with --admin-token-file; robots register with the
 secret of --enrolment-token-file. CAIRN_ADMIN_TOKEN and CAIRN_ENROLMENT_TOKEN do the same from the environment.
 `cairn token` gives tokens for less than everything. Beyond a network that you trust, use --tls-cert and --tls-key.
+At SIGHUP it reads its certificate and the files of its tokens again; a file may have several, a line each.
 
     $ cat server.toml
     keep_evidence_s = 604_800
@@ -35,6 +36,7 @@ More commands look after the store (docs/administrator.md, docs/scale.md); each 
 """
 
 import ctypes
+import errno
 import gc
 import logging
 import resource
@@ -63,8 +65,9 @@ from cairn_server.http.routes.long_bodies import LongBodies, fork_long_bodies
 from cairn_server.operations import check as check_command
 from cairn_server.operations.backup import back_up_command, restore_command
 from cairn_server.operations.bucket_owner import adopt_command
+from cairn_server.operations.reload import Reload
 from cairn_server.operations.serve_options import serve_parser, settings_of
-from cairn_server.operations.store_opening import settling, store_of
+from cairn_server.operations.store_opening import opened, settling, store_of
 from cairn_server.operations.upstream import joined
 from cairn_server.service import Service
 from cairn_server.settings import LOOPBACK, Settings
@@ -110,6 +113,9 @@ def main(argv: list[str]) -> int:
     settings.check_store()
     settings = settings.model_copy(update={"limit_concurrency": connections_within(settings.limit_concurrency)})
     signal.signal(signal.SIGTERM, _stop)
+    signal.signal(
+        signal.SIGHUP, signal.SIG_IGN
+    )  # until there is something to reload; what is forked ignores it for good
     sys.setswitchinterval(SWITCH_S)
     # Forked before there are threads: a lock that another thread held at the fork would stay locked in the child.
     open_store, reads_of = store_of(settings)
@@ -120,8 +126,9 @@ def main(argv: list[str]) -> int:
     keep_memory_small()
     with _folder_of(settings), listen(settings.host, settings.port) as listener:
         try:
-            service = Service(open_store(), settings, fold_process=folding)
-            with closing(service), _views_of(service), settling(service), joined(service):
+            service = Service(opened(open_store, settings), settings, fold_process=folding)
+            with closing(service), _views_of(service), settling(service), joined(service) as relay:
+                Reload(service, lambda: settings_of(args), relay).at_signal()
                 _serve(service, listener, long_bodies)
         except KeyboardInterrupt:
             pass
@@ -158,7 +165,7 @@ def _serve(service: Service, listener: socket.socket, long_bodies: LongBodies) -
     config = config_of(app, service.settings)
     host, port = listener.getsockname()[:2]
     shown = f"[{host}]" if ":" in host else host
-    scheme = "https" if config.is_ssl else "http"
+    scheme = "https" if service.certificate is not None else "http"
     if scheme == "http" and host not in LOOPBACK:
         log.warning("tokens and maps travel in the clear: give --tls-cert and --tls-key, or put a TLS proxy before it")
     tell_port(service.settings.folder, port)
@@ -208,11 +215,7 @@ class _Server(uvicorn.Server):
 
 
 def config_of(app: FastAPI, settings: Settings, *, log_level: str = "warning") -> uvicorn.Config:
-    """Configuration with which uvicorn serves the app.
-
-    Raises:
-        BadInputError: kind `bad_setting`: no certificate, or not with this key.
-    """
+    """Configuration with which uvicorn serves the app."""
     places = app.state.places
     proxies = settings.trusted_proxies.split()
     config = uvicorn.Config(
@@ -226,18 +229,13 @@ def config_of(app: FastAPI, settings: Settings, *, log_level: str = "warning") -
         server_header=False,
         timeout_graceful_shutdown=GRACE_S,
         lifespan="off",
-        ssl_certfile=settings.tls_cert,
-        ssl_keyfile=settings.tls_key,
         **WEBSOCKETS,
     )
-    try:
-        config.load()
-    except OSError as exc:  # ssl.SSLError is one
-        raise BadInputError("bad_setting", f"--tls-cert {settings.tls_cert}, --tls-key: {exc}") from exc
-    if config.ssl is not None:
-        # Not by uvicorn: it would count a connection only after its handshake.
-        config.http_protocol_class = secured(config.http_protocol_class, config.ssl, places, settings.head_s)  # type: ignore[assignment,arg-type]
-        config.ssl = None
+    config.load()
+    certificate = app.state.service.certificate
+    if certificate is not None:
+        # Not by uvicorn: it would count a connection only after its handshake, and show one certificate for ever.
+        config.http_protocol_class = secured(config.http_protocol_class, certificate, places, settings.head_s)  # type: ignore[assignment,arg-type]
     return config
 
 
@@ -260,10 +258,19 @@ def listen(host: str, port: int) -> socket.socket:
         listener.bind((host, port))
     except OSError as exc:
         listener.close()
-        message = f"cannot listen on {host}:{port}: {exc.strerror}; another server may, try --port 0"
+        message = f"cannot listen on {host}:{port}: {exc.strerror}; {_way_out(exc, host)}"
         raise BadInputError("cannot_listen", message) from exc
     listener.listen(BACKLOG)
     return listener
+
+
+def _way_out(exc: OSError, host: str) -> str:
+    """Next step of an administrator whose server cannot listen."""
+    if isinstance(exc, socket.gaierror) or exc.errno in (errno.EADDRNOTAVAIL, errno.EINVAL):
+        return f"{host or 'an empty --host'} is no address of this machine: give one that it has, or 0.0.0.0 for all"
+    if exc.errno == errno.EACCES:
+        return "ports below 1024 are the system's: take another one, or give the server CAP_NET_BIND_SERVICE"
+    return "another program does; stop it, or take another --port (0: any free one)"
 
 
 def keep_memory_small() -> None:

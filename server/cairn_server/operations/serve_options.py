@@ -28,9 +28,10 @@ from pydantic_settings import (
     SettingsError,
 )
 
-from cairn_map.errors import EXIT_CODES, BadInputError
+from cairn_map.errors import EXIT_CODES, BadInputError, complaint_text
 from cairn_server.http.middleware.log_format import LogForm
 from cairn_server.settings import Settings
+from cairn_server.store.private_files import warn_if_open
 
 PREFIX, BETWEEN = "CAIRN_", "__"
 MEGABYTE = 1 << 20
@@ -161,6 +162,7 @@ def settings_of(args: argparse.Namespace) -> Settings:
         path = getattr(args, f"{name}_file", None)
         if path is not None:
             given[name] = _text_of(path).strip()
+            warn_if_open(path)
     # The file is read once, and looked at last.
     file: Path | None = getattr(args, "settings", None)
     in_file = _table_of(file) if file is not None else {}
@@ -190,11 +192,7 @@ def settings_of(args: argparse.Namespace) -> Settings:
         first = exc.errors()[0]
         names = [str(part) for part in first["loc"]]
         unknown = first["type"] == "extra_forbidden"
-        message = (
-            "there is no such setting; see `cairn serve --help`"
-            if unknown
-            else first["msg"].removeprefix("Value error, ")
-        )
+        message = "there is no such setting; see `cairn serve --help`" if unknown else complaint_text(first["msg"])
         raise BadInputError("bad_setting", f"{_origin(names, given, file)}: {message}") from exc
 
 

@@ -5,11 +5,15 @@ import secrets
 from collections.abc import Callable
 from contextlib import AbstractContextManager, closing, nullcontext
 from functools import partial
+from pathlib import Path
 
-from cairn_map.errors import BadInputError
+from cairn_map.errors import BadInputError, ConflictError
 from cairn_server.folding.folding import FoldReads
 from cairn_server.service import Service
 from cairn_server.settings import Settings
+from cairn_server.store.backup_note import NOTE_NAME
+from cairn_server.store.folder_lock import LOCK_NAME
+from cairn_server.store.sqlite.ended_tokens import LIST_NAME
 from cairn_server.store.sqlite.readers import Readers
 from cairn_server.store.sqlite.reads import SqliteReads
 from cairn_server.store.sqlite.store import FILE_NAME, SqliteStore
@@ -17,6 +21,9 @@ from cairn_server.store.store import Store
 
 log = logging.getLogger(__name__)
 
+OWN_NAMES = frozenset({LOCK_NAME, LIST_NAME, NOTE_NAME, "kernels", "lost+found"})
+"""Names next to a store: compiled kernels come before it; and that of a new file system."""
+NAMED_MAX = 3
 FOLD_CONNECTIONS = 4
 """Connections to the database of the process that plans folds: it has two threads."""
 SETTLE_CONNECTIONS = 2
@@ -74,6 +81,53 @@ def store_of(settings: Settings) -> tuple[Callable[[], Store], Callable[[], Fold
         return store
 
     return open_store, lambda: PgReads(Connections(url, limit=FOLD_CONNECTIONS), ahead=ReadAhead(open_bucket(place)))
+
+
+def opened(open_store: Callable[[], Store], settings: Settings) -> Store:
+    """The open store; one without maps is announced, since it may be there by mistake.
+
+    A server that finds no maps where many were looks like a healthy one: to robots, probes and the page.
+
+    Raises:
+        ConflictError: kind `not_empty`: the folder has no store, and files of others.
+        CairnError: the store's own.
+    """
+    what = f"the store in {settings.place} has no maps"
+    if settings.store is None:
+        what = _news_of_folder(settings.folder) or what
+    store = open_store()
+    if not store.maps():
+        flag = "--store" if settings.store is not None else "--data"
+        log.warning("%s: if it should have some, stop, and see whether %s is right and its disk is mounted", what, flag)
+    return store
+
+
+def _news_of_folder(folder: Path) -> str | None:
+    """Text on the store that is to be made in a folder; None if there is one.
+
+    Raises:
+        ConflictError: kind `not_empty`.
+        BadInputError: kind `bad_store`: the folder cannot be read.
+    """
+    try:
+        if (folder / FILE_NAME).exists():
+            return None
+        if not folder.exists():
+            return f"{folder} is new, and so is the store in it, without maps"
+        found = sorted(
+            path.name
+            for path in folder.iterdir()
+            if path.name not in OWN_NAMES and not path.name.startswith((".", FILE_NAME))
+        )
+    except OSError as exc:
+        raise BadInputError("bad_store", f"cannot keep a store in {folder}: {exc.strerror}") from exc
+    if found:
+        raise ConflictError(
+            "not_empty",
+            f"{folder} has no store, but other files ({', '.join(found[:NAMED_MAX])}): name the folder that the maps "
+            f"are in, or one for them alone, such as --data {folder / 'cairn-data'}",
+        )
+    return f"the store in {folder} is new, without maps"
 
 
 def settling(service: Service) -> AbstractContextManager[object]:

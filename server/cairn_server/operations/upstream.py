@@ -10,7 +10,7 @@ from importlib.metadata import entry_points
 from typing import Protocol
 
 from cairn_map.commits.ids import CommitId
-from cairn_map.errors import BadInputError, ConflictError, NotFoundError
+from cairn_map.errors import BadInputError, CairnError, ConflictError, NotFoundError
 from cairn_map.wire.messages import CreateMap, MapInfo
 from cairn_map.wire.relay_peer import TOO_MANY_MAPS, Held, MapEnd, OwnServer, SignedCommit
 from cairn_server.access.auth import UPSTREAM
@@ -28,21 +28,25 @@ class Relay(Protocol):
         """Note that this server has something new."""
         ...
 
+    def use_token(self, token: str | None) -> None:
+        """Show the upstream server this token from now on."""
+        ...
+
     def stop(self) -> None:
         """End soon."""
         ...
 
 
 @contextmanager
-def joined(service: Service) -> Iterator[None]:
-    """Hold the same commits as the upstream server, if one is set, for the length of a `with`.
+def joined(service: Service) -> Iterator[Relay | None]:
+    """Hold the same commits as the upstream server, if one is set, for the length of a `with`; its relay.
 
     Raises:
         BadInputError: kind `bad_setting`: the relay is not installed; or `bad_url`.
     """
     settings = service.settings
     if settings.upstream is None:
-        yield
+        yield None
         return
     point = next(iter(entry_points(group=GROUP)), None)
     if point is None:
@@ -52,7 +56,7 @@ def joined(service: Service) -> Iterator[None]:
     relay: Relay = point.load()(settings.upstream, settings.upstream_token, OwnMaps(service))
     service.sync.upstream.connect(relay.wake)
     try:
-        yield
+        yield relay
     finally:
         relay.stop()
 
@@ -126,6 +130,10 @@ class OwnMaps:
     def handed_over(self, map_name: str, begun_s: float) -> None:
         """Note that all of a map at this age of the store was given to the upstream, if it can travel."""
         self._service.sync.upstream.handed_over(map_name, begun_s)
+
+    def note_round(self, map_name: str | None, ill: CairnError | None) -> None:
+        """Note how a round with the upstream went."""
+        self._service.sync.upstream.note_round(map_name, ill)
 
 
 _IS_AN_OWN_SERVER: type[OwnServer] = OwnMaps

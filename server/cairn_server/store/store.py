@@ -35,6 +35,7 @@ from cairn_server.store.store_rows import (
     Contribution,
     EntrySize,
     Fold,
+    HeardRobot,
     MapRow,
     NamedCommit,
     NewCommit,
@@ -184,6 +185,10 @@ class BranchNotes(Protocol):
 
     def statuses(self, row: MapRow) -> dict[str, str]:
         """Last status of each branch that ever reported one."""
+        ...
+
+    def heard(self, *, limit: int) -> list[HeardRobot]:
+        """Robots of all maps by their last signs, the newest first; a sign may be missing for some seconds."""
         ...
 
     def entry_sizes(self, row: MapRow, *, after_seq: int, limit: int) -> list[EntrySize]:

@@ -210,6 +210,16 @@ class Branch:
     """Incarnation with which it registered last; empty in stores of early versions."""
 
 
+@dataclass(frozen=True, slots=True)
+class HeardRobot:
+    """Last sign of a registered robot."""
+
+    map: str
+    robot: str
+    heard_s: float
+    """Time of the sign, UTC seconds since 1970."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Totals:
     """Sizes of a map."""

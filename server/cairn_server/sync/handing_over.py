@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from cairn_map.commits.commit import CommitMeta, commit_bytes, version_of_meta
 from cairn_map.commits.ids import OPERATOR, SERVERS_OWN, commit_id_from_text
 from cairn_map.commits.signature import Signature, SigningKey, signatures_to_text, speaks_for
-from cairn_map.errors import ConflictError, DeniedError, NotFoundError, UnreachableError
+from cairn_map.errors import CairnError, ConflictError, DeniedError, NotFoundError, UnreachableError
 from cairn_server.access.auth import Caller, Role
 from cairn_server.store.replica_notes import ReplicaNotes
 from cairn_server.store.store import Store
@@ -120,6 +120,9 @@ class UpstreamProgress:
         self._read_next_s = -math.inf
         self._handed_over_s: Mapping[str, float] = {}
         self._wake_relay: Callable[[], None] = lambda: None
+        self._since_s = age.now_s()
+        self._whole_ill: CairnError | None = UnreachableError("not_ready", "it was not asked yet")
+        self._ills: Mapping[str, CairnError | None] = {}
 
     def connect(self, wake_relay: Callable[[], None]) -> None:
         """Give the function that tells a running relay of new commits; it neither fails nor waits."""
@@ -138,10 +141,36 @@ class UpstreamProgress:
             self._notes.put_handed_over(self._upstream, map_name, begun_s)
         self._read_next_s = -math.inf
 
-    def ages_s(self) -> dict[str, float]:
-        """Seconds since all of a map was handed to the upstream server, by the map's name."""
-        now_s = self._age.now_s()
-        return {name: now_s - begun_s for name, begun_s in self._marks().items()}
+    def note_round(self, map_name: str | None, ill: CairnError | None) -> None:
+        """Note how a round went with a map, or (None) with the upstream server as a whole; None: well."""
+        if map_name is None:
+            self._whole_ill = ill
+        else:
+            self._ills = {**self._ills, map_name: ill}
+
+    def ages_s(self, map_names: Collection[str]) -> dict[str, float]:
+        """Seconds since all of each map was handed to the upstream server, or since the start if it was not yet."""
+        if self._upstream is None:
+            return {}
+        now_s, marks = self._age.now_s(), self._marks()
+        return {name: now_s - marks.get(name, self._since_s) for name in map_names}
+
+    def ups(self, map_names: Collection[str]) -> dict[str, bool]:
+        """True for each map with which the last round went well; the server as a whole has the name `""`."""
+        if self._upstream is None:
+            return {}
+        is_up = self._whole_ill is None
+        ills = self._ills
+        return {"": is_up} | {name: is_up and name in ills and ills[name] is None for name in map_names}
+
+    def complaint(self) -> str | None:
+        """Reason why this server is not well: its upstream refuses it. Without a link it goes on, as it should."""
+        ills = [self._whole_ill, *self._ills.values()]
+        if self._upstream is None or all(ill is None or isinstance(ill, UnreachableError) for ill in ills):
+            return None
+        return (
+            "upstream_refused: the upstream server refuses this one, or some of its maps or commits; the log says why"
+        )
 
     def may_forget_s(self, map_name: str) -> float:
         """Age of the store before which evidence is on the upstream, too, and may go; infinite without one."""

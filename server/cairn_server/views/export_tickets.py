@@ -20,8 +20,7 @@ from functools import partial
 
 from cairn_map.errors import DeniedError, UnreachableError
 from cairn_map.files.export_request import ExportRequest, ExportTicket
-from cairn_server.access.auth import READING, caller_of_hash, require, token_hash
-from cairn_server.settings import Settings
+from cairn_server.access.auth import READING, TokenHolders, require, token_hash
 from cairn_server.store.replica_notes import TicketNote
 from cairn_server.store.store import Store
 from cairn_server.store.store_rows import MapRow
@@ -50,9 +49,9 @@ class _Ticket:
 class ExportTickets:
     """Tickets that were given and not shown yet; thread-safe."""
 
-    def __init__(self, store: Store, settings: Settings, exports: MapExports) -> None:
+    def __init__(self, store: Store, holders: TokenHolders, exports: MapExports) -> None:
         self._store = store
-        self._settings = settings
+        self._holders = holders
         self._exports = exports
         self._notes = store.replicas.tickets if store.replicas is not None else None
         self._lock = threading.Lock()
@@ -127,7 +126,7 @@ class ExportTickets:
         return while_allowed(self._exports.asked(row, asked), partial(self._check_token, note.holder, row))
 
     def _check_token(self, holder: bytes | None, row: MapRow) -> None:
-        require(caller_of_hash(holder, row, self._store, self._settings), *READING)
+        require(self._holders.of_hash(holder, row), *READING)
 
     def close(self) -> None:
         """End all tickets."""

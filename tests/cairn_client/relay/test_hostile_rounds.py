@@ -116,7 +116,7 @@ def test_an_upstream_that_answers_one_map_with_nonsense_holds_up_no_other(
         until(lambda: field.ids() == base.ids(), "the sound map's commits came")
         assert said in caplog.text
         between.says = None
-        until(lambda: ODD in field.service.sync.upstream.ages_s(), "the odd map goes on once its answers are sound")
+        until(lambda: ODD in field.service.sync.upstream._marks(), "the odd map goes on once its answers are sound")
 
 
 def test_a_relay_that_goes_on_outlives_nonsense_in_between(
@@ -160,7 +160,7 @@ def test_an_upstream_makes_no_more_maps_than_the_setting_allows(
 
         with HostileServer(answer_to) as hostile:
             field.relays.append(Upstream(hostile.url, ADMIN, OwnMaps(field.service), every_s=EVERY_S))
-            until(lambda: MAP in field.service.sync.upstream.ages_s(), "a whole round")
+            until(lambda: MAP in field.service.sync.upstream._marks(), "a whole round")
             until(lambda: "upstream_maps_max" in caplog.text, "the others are reported")
             before = len(hostile.requests)
             until(lambda: len(hostile.requests) > before + 8, "some more rounds")

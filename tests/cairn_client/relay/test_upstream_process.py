@@ -39,6 +39,7 @@ def test_a_field_server_joins_a_base_by_its_options_and_goes_on_without_it(tmp_p
         base.folded(base.row)
         secret = tmp_path / "secret"
         secret.write_text(base.token("field", role="relay"))
+        secret.chmod(0o600)
         options = ("--upstream", base.url, "--upstream-token-file", str(secret), "--trust-server", base.key)
         field = Process(tmp_path / "field", *options)
         assert field.url is not None

@@ -9,6 +9,7 @@ from tests.fixtures.server.certificate import certificate  # noqa: F401 - a fixt
 
 from cairn_map.errors import BadInputError
 from cairn_server.access.own_names import OwnNames
+from cairn_server.access.server_certificate import ServerCertificate
 from cairn_server.settings import Settings
 
 MACHINE = socket.gethostname().lower()
@@ -33,10 +34,10 @@ def test_without_any_the_address_of_the_connection_counts_and_the_name_of_the_ma
 @pytest.mark.processes  # openssl makes the certificate
 @pytest.mark.skipif(not shutil.which("openssl"), reason="the openssl command makes the certificate")
 def test_a_certificate_says_who_the_server_is(certificate: Path) -> None:  # noqa: F811 - the fixture
-    names = OwnNames.of(Settings(tls_cert=certificate / "cert.pem"))
+    names = OwnNames.of(Settings(), ServerCertificate(certificate / "cert.pem", certificate / "key.pem"))
     assert names.origins("https", ("192.168.1.5", 8750)) == {"https://127.0.0.1:8750"}
     with pytest.raises(BadInputError, match="--tls-cert"):
-        OwnNames.of(Settings(tls_cert=certificate / "none.pem"))
+        ServerCertificate(certificate / "none.pem", certificate / "key.pem")
 
 
 def test_what_is_no_url_is_no_public_name() -> None:

@@ -116,3 +116,16 @@ def test_threads_that_ended_make_it_not_ready(live: Live) -> None:
 def test_a_server_told_to_stop_is_not_ready(live: Live) -> None:
     live.service.readiness.close()
     assert reasons(live).startswith("shutting_down: ")
+
+
+def test_a_disk_at_its_bound_does_not_come_and_go(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Free space around the bound, look by look: ready until it is below, then not until it is a quarter above."""
+    least, health = live.service.settings.disk_free_min_bytes, store_of(live).health
+    seen: list[bool] = []
+    for part in (1.3, 1.0, 0.99, 1.0, 1.24, 1.1, 1.25, 1.0, 0.5, 1.24, 2.0):
+        monkeypatch.setattr(health, "_free_bytes", lambda part=part: round(part * least))
+        said = reasons(live)
+        seen.append(said == "")
+        assert said == "" or said.startswith("disk_full: ")
+    ready, short = True, False
+    assert seen == [ready, ready, short, short, short, short, ready, ready, short, short, ready]

@@ -9,7 +9,7 @@ import httpx
 import pytest
 from tests.fixtures.map.bombs import BOMBS, DEEP, commit_of
 from tests.fixtures.map.made import ROBOT, SMALL
-from tests.fixtures.server.live import DEADLINE_S, Process
+from tests.fixtures.server.live import DEADLINE_S, Live, Process
 from tests.fixtures.server.pushes import pushed
 from tests.fuzz.json_mutator import mutated_json
 from tests.fuzz.wrapping_mutator import bytewise, mutated_commit
@@ -104,3 +104,12 @@ def test_json_that_is_wrong_everywhere_is_refused_at_its_first_error(
     answer = http.post(path, content=body, headers={"Content-Type": "application/json"})
     assert answer.status_code == 422
     assert process.peak_mb() - before_mb < GROWTH_JSON_MB_MAX
+
+
+def test_a_complaint_has_none_of_the_words_of_the_library(live: Live) -> None:
+    """`body: Value error, a robot's token names ...` was answered, and shown as it was."""
+    for body in ({"role": "robot"}, {"role": "admin", "robot": "mole"}):
+        answer = live.http.put("/tokens/eye", json=body)
+        assert answer.status_code == 422
+        assert "token" in answer.json()["detail"]
+        assert "Value error" not in answer.json()["detail"]

@@ -75,14 +75,14 @@ def _replay(args: argparse.Namespace) -> int:
         times="recorded",
     ) as robot:
         if robot.replica.layer.has_epochs:
-            _try_sync(robot)  # it learns the server's time, by which epochs are counted
+            _missed_sync(robot)  # it learns the server's time, by which epochs are counted
         commits = _map_stops(robot, source, stops, Profile(args.profile) if args.profile else None, group)
         with (state / REPLAYED_FILE).open("a") as file:
             file.write(f"{part}\n")
         mapped_s = time.monotonic() - start_s
         # The second round tells the server where this robot stands now.
-        is_linked = _try_sync(robot) and _try_sync(robot)
-        is_folded = is_linked and _is_folded(robot)
+        missed = _missed_sync(robot) or _missed_sync(robot)
+        is_folded = missed is None and _is_folded(robot)
         total_s = time.monotonic() - start_s
         waiting, traffic, returns = robot.waiting, robot.traffic, robot.returns
     say(
@@ -92,8 +92,9 @@ def _replay(args: argparse.Namespace) -> int:
     say(returns_line(returns))
     if is_folded:
         say(f"all of it is in the server's map: {total_s:.1f} s in all, with push and fold")
-    if not is_linked:
-        say(f"no link to {args.map}: `cairn robot sync {state} --map URL` pushes them when there is one")
+    if missed is not None:
+        why = "no link to it" if missed.kind == "no_link" else f"{missed.message} [{missed.kind}]"
+        say(f"not all is on {args.map}: {why}; `cairn robot sync {state} --map URL` pushes them later")
     return 0
 
 
@@ -113,7 +114,7 @@ def _map_stops(
         if group is None:
             commits += _commit(robot, profile, note) is not None
         if time.monotonic() - last_sync_s > SYNC_EVERY_S:
-            _try_sync(robot)
+            _missed_sync(robot)
             last_sync_s = time.monotonic()
     return commits + (_commit(robot, profile, note) is not None)
 
@@ -157,19 +158,20 @@ def _commit(robot: Robot, profile: Profile | None, note: str) -> Commit | None:
     try:
         return robot.commit(profile=profile, note=note)
     except UnreachableError as exc:
-        if exc.kind != "outbox_full" or not (_try_sync(robot) and _try_sync(robot)):
+        if exc.kind != "outbox_full" or _missed_sync(robot) or _missed_sync(robot):
             raise
         return robot.commit(profile=profile, note=note)
 
 
-def _try_sync(robot: Robot) -> bool:
+def _missed_sync(robot: Robot) -> UnreachableError | None:
+    """Error of a sync that is to be tried again later; None: it was done."""
     try:
         robot.sync()
-    except UnreachableError:
-        return False
+    except UnreachableError as exc:
+        return exc
     except DamagedDataError as exc:
         log.error("%s", exc.message)  # mapping goes on: sound cells have come, and own commits are pushed
-    return True
+    return None
 
 
 def _is_folded(robot: Robot) -> bool:

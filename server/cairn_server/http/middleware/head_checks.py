@@ -1,4 +1,4 @@
-"""Checks of a request's head: same origin, where the server is open, version of the protocol, path. Plain ASGI."""
+"""Heads of requests: checks of same origin, where the server is open, of protocol and path; HEAD itself. Plain ASGI."""
 
 import re
 from collections.abc import MutableMapping
@@ -129,3 +129,41 @@ class DeniedHandshakes:
         await self._app(scope, receive, noted)
         if is_denied:
             raise ClientDisconnected
+
+
+class _HeadSentError(Exception):
+    """The answer is whole, and its body need not be made."""
+
+
+class HeadRequests:
+    """Middleware that hands HEAD on as GET, and sends nothing of the body that comes (RFC 9110, 9.3.2); the innermost.
+
+    Probes, link checkers and `curl --head` ask so. A route does not know of it: its answer is cut off behind the head,
+    so that a stream of events, which has no end, ends, too.
+    """
+
+    def __init__(self, app: App) -> None:
+        self._app = app
+
+    async def __call__(self, scope: MutableMapping[str, Any], receive: Receive, send: Send) -> None:
+        """Pass a request on."""
+        if scope["type"] != "http" or scope["method"] != "HEAD":
+            await self._app(scope, receive, send)
+            return
+
+        async def send_head(message: Message) -> None:
+            if message["type"] != "http.response.body":
+                await send(message)
+                return
+            await send({**message, "body": b"", "more_body": False})
+            if message.get("more_body", False):
+                raise _HeadSentError
+
+        # In place, and put back: those around share the scope, and note in it which route was found.
+        scope["method"] = "GET"
+        try:
+            await self._app(scope, receive, send_head)
+        except _HeadSentError:
+            pass
+        finally:
+            scope["method"] = "HEAD"

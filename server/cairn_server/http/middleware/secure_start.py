@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 from cairn_server.access.connection_places import ConnectionPlace, ConnectionPlaces
+from cairn_server.access.server_certificate import ServerCertificate
 from cairn_server.http.middleware.deadlines import PunctualProtocol, address_of
 
 log = logging.getLogger(__name__)
@@ -92,11 +93,17 @@ def _forget_frames(exc: BaseException) -> None:
 
 
 def secured(
-    protocol: Callable[..., PunctualProtocol], context: ssl.SSLContext, places: ConnectionPlaces, handshake_s: float
+    protocol: Callable[..., PunctualProtocol],
+    certificate: ServerCertificate,
+    places: ConnectionPlaces,
+    handshake_s: float,
 ) -> Callable[..., SecureStart]:
-    """Factory of connections that begin with a handshake, with the arguments that uvicorn gives."""
+    """Factory of connections that begin with a handshake, with the arguments that uvicorn gives.
+
+    Each shows the certificate of its moment.
+    """
 
     def make(**arguments: Any) -> SecureStart:
-        return SecureStart(protocol(**arguments), context, places, handshake_s)
+        return SecureStart(protocol(**arguments), certificate.context, places, handshake_s)
 
     return make

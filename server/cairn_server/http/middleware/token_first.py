@@ -12,7 +12,7 @@ from collections.abc import Hashable, Iterable, MutableMapping
 from typing import Any
 
 from cairn_map.errors import BadInputError, CairnError, DeniedError
-from cairn_server.access.auth import Caller, Role, caller_of
+from cairn_server.access.auth import Caller, Role
 from cairn_server.access.own_names import OwnNames
 from cairn_server.http.middleware.asgi import App, Receive, Send, send_problem
 from cairn_server.service import Service
@@ -57,7 +57,7 @@ class TokenFirst:
         token = _token_in(scope["headers"]) or offered_token(scope.get("subprotocols", ()))
         try:
             # On the event loop, as in the routes: a look-up by key takes 40 us, a change of threads longer.
-            return caller_of(token, None, self._service.store, self._service.settings)
+            return self._service.holders.of(token, None)
         except DeniedError:
             proof, path = _first(scope["headers"], b"cairn-proof"), REGISTRATION.fullmatch(scope["path"])
             if token is not None or not proof or path is None:

@@ -16,7 +16,7 @@ from starlette.requests import HTTPConnection
 from cairn_map.commits.commit import EPOCH_VERSION, SUM_VERSION
 from cairn_map.commits.key_proof import PROOF_TEXT_MAX
 from cairn_map.errors import BadInputError, DeniedError, NotFoundError
-from cairn_server.access.auth import READING, Caller, Role, bad_token, caller_of, require, require_all_maps
+from cairn_server.access.auth import READING, Caller, Role, bad_token, require, require_all_maps
 from cairn_server.access.own_names import OwnNames
 from cairn_server.service import Service
 from cairn_server.store.store_rows import MapRow
@@ -53,7 +53,7 @@ class Asker:
     def caller(self, row: MapRow | None) -> Caller:
         """The caller, on a map or (None) where none is named; a token of one map counts on that map only."""
         token = self.credentials.credentials if self.credentials else None
-        return caller_of(token, row, self.service.store, self.service.settings)
+        return self.service.holders.of(token, row)
 
     def reader(self, name: str) -> MapRow:
         """The map of a name, if the caller may read it."""

@@ -101,12 +101,6 @@ def voxel_of_point(
     return asked_voxel(service.store, service.cells, row, voxel_at(row.geometry, at), at_s=_time_s(time))
 
 
-@router.head(
-    "/maps/{name}/main/cells/{cell}",
-    dependencies=READERS,
-    response_class=Response,
-    responses=answers({200: CELL_TYPES, 304: ()}, headers=CELL_HEADERS),
-)
 @router.get(
     "/maps/{name}/main/cells/{cell}",
     dependencies=READERS,

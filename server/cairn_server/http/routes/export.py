@@ -1,7 +1,7 @@
 """Routes by which a map leaves the server: as a picture, as a file of points or an octree, or as what changed."""
 
 from functools import partial
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from fastapi.responses import StreamingResponse
@@ -18,7 +18,7 @@ from cairn_server.http.routes.callers import READERS, Asking, Credentials, Map, 
 from cairn_server.http.routes.documentation import answers, json_body, problems
 from cairn_server.http.routes.json_bodies import json_of
 from cairn_server.store.store_rows import MapRow
-from cairn_server.views.map_exports import while_allowed
+from cairn_server.views.map_exports import Export, while_allowed
 
 PICTURES = {"png": "image/png", "npz": "application/x-npz"}
 
@@ -29,6 +29,10 @@ class _Download(StreamingResponse):
     """File on its way, which ends without its end once its token has ended: the connection is cut."""
 
     _place: ConnectionPlace | None = None
+
+    def __init__(self, export: Export, **options: Any) -> None:
+        super().__init__(export.parts, **options)
+        self._export = export
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request."""
@@ -43,6 +47,8 @@ class _Download(StreamingResponse):
             # By itself the answer would be an error in the log. A proxy's connection is left to it.
             if self._place is not None and self._place.cut is not None:
                 self._place.cut()
+        finally:
+            self._export.close()  # also of a file whose reader went away before its first cell
 
 
 @router.get(
@@ -111,7 +117,7 @@ def export(
     }
     if made.size_bytes is not None:
         headers["Content-Length"] = str(made.size_bytes)
-    return _Download(made.parts, media_type=EXPORT_TYPES[asked.format], headers=headers)
+    return _Download(made, media_type=EXPORT_TYPES[asked.format], headers=headers)
 
 
 @router.post(

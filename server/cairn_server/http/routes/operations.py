@@ -39,11 +39,12 @@ def metrics_reader(asker: Asking) -> None:
 def readyz(service: Operations) -> dict[str, str]:
     """The server can take a push and bring it into the map; else 503 says why not.
 
-    A clock that is not trusted takes no server out of service: what it hands out and takes is less, and right.
+    A clock that is not trusted takes no server out of service: what it hands out and takes is less, and right. Nor does
+    an upstream server that refuses this one: robots map on here.
     """
     service.readiness.check()
-    complaint = service.clock.complaint()
-    return {"status": "ready"} | ({"degraded": complaint} if complaint else {})
+    complaints = [ill for ill in (service.clock.complaint(), service.sync.upstream.complaint()) if ill]
+    return {"status": "ready"} | ({"degraded": "; ".join(complaints)} if complaints else {})
 
 
 @router.get("/metrics", response_class=PlainTextResponse, dependencies=[Depends(metrics_reader)])

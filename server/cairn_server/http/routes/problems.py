@@ -18,6 +18,7 @@ from cairn_map.errors import (
     DeniedError,
     NotFoundError,
     UnreachableError,
+    complaint_text,
 )
 from cairn_map.wire.messages import Problem
 
@@ -80,7 +81,7 @@ def _of_cairn(request: Request, exc: CairnError) -> JSONResponse:
 def _of_validation(request: Request, exc: RequestValidationError) -> JSONResponse:
     first = exc.errors()[0]
     where = ".".join(str(part) for part in first["loc"])
-    return _problem(422, "bad_message", f"{where}: {first['msg']}", {})
+    return _problem(422, "bad_message", f"{where}: {complaint_text(first['msg'])}", {})
 
 
 def _of_http(request: Request, exc: HTTPException) -> JSONResponse:

@@ -15,7 +15,7 @@ from cairn_server.store.postgres.schema import NOW_S
 from cairn_server.store.postgres.shares import lock_head
 from cairn_server.store.postgres.tokens import put_registration, remove_tokens_of
 from cairn_server.store.postgres.writing_threads import WritingThreads
-from cairn_server.store.store_rows import Branch, EntrySize, MapRow
+from cairn_server.store.store_rows import Branch, EntrySize, HeardRobot, MapRow
 
 _SELECT = "SELECT name, mode, sensors, cursor, last_seen_s, incarnation FROM branch WHERE map = %s"
 
@@ -132,6 +132,15 @@ class PgBranches:
         self._threads.flush()
         with self._connections.lent() as connection:
             return dict(rows(connection, "SELECT name, status FROM branch_status WHERE map = %s", (row.number,)))
+
+    def heard(self, *, limit: int) -> list[HeardRobot]:
+        """Robots of all maps by their last signs, the newest first."""
+        query = (
+            "SELECT map.name, branch.name, last_seen_s FROM branch JOIN map ON map.map = branch.map"
+            " ORDER BY last_seen_s DESC, 1, 2 LIMIT %s"
+        )
+        with self._connections.lent() as connection:
+            return [HeardRobot(*columns) for columns in rows(connection, query, (limit,))]
 
     def entry_sizes(self, row: MapRow, *, after_seq: int, limit: int) -> list[EntrySize]:
         """Log entries after one, oldest first, at most `limit`."""

@@ -14,7 +14,7 @@ import apsw
 from cairn_map.errors import BadInputError, DamagedDataError, NotFoundError
 from cairn_server.store.sqlite.readers import Readers
 from cairn_server.store.sqlite.reads import SqliteReads
-from cairn_server.store.sqlite.schema import STEPS
+from cairn_server.store.sqlite.schema import STEPS, newer_store
 from cairn_server.store.sqlite.store import SqliteStore
 from cairn_server.store.sqlite.writer import first, rows
 
@@ -38,6 +38,9 @@ class SqliteArchive(SqliteStore):
         SqliteReads.__init__(self, Readers(path))
         with self._readers.reading() as reader:
             version = reader.pragma("user_version")
+        if version > len(STEPS):
+            self._readers.close()
+            raise newer_store(f"the store {path}", version)
         if version != len(STEPS):
             self._readers.close()
             raise BadInputError(

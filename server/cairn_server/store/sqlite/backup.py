@@ -6,6 +6,7 @@ write-ahead log. The copy has its name only when all of it is on the disk.
 """
 
 import os
+import struct
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -14,16 +15,25 @@ from pathlib import Path
 import apsw
 
 from cairn_map.errors import BadInputError, ConflictError, DamagedDataError, NotFoundError
+from cairn_server.store.backup_note import note_backup
 from cairn_server.store.folder_lock import LOCK_NAME, lock_folder
 from cairn_server.store.sqlite.archive import check_form
 from cairn_server.store.sqlite.ended_tokens import LIST_NAME, copy_list, ended_since
-from cairn_server.store.sqlite.schema import STEPS, ensure_schema
+from cairn_server.store.sqlite.failures import is_full, opening_failure
+from cairn_server.store.sqlite.schema import STEPS, ensure_schema, newer_store
 from cairn_server.store.sqlite.store import FILE_NAME
 from cairn_server.store.sqlite.writer import BUSY_MS
 
 STEP_PAGES = 256
 """Copied at once: 4 MB."""
 SIDES = ("", "-wal", "-shm", "-journal")
+MAGIC = b"SQLite format 3\0"
+HEAD = struct.Struct(">16xH10xI")
+"""Beginning of a file of SQLite: the size of a page (1: 2^16), and the count of pages."""
+UNREADABLE = frozenset(
+    {apsw.SQLITE_IOERR_READ, apsw.SQLITE_IOERR_SHORT_READ, apsw.SQLITE_IOERR_DATA, apsw.SQLITE_IOERR_CORRUPTFS}
+)
+"""Failures to read, not to write."""
 
 Report = Callable[[int, int], None]
 """Called with pages done and all pages."""
@@ -34,17 +44,24 @@ def back_up(folder: Path, target: Path, report: Report) -> int:
 
     Raises:
         NotFoundError: kind `no_store`: the folder has none.
-        BadInputError: kind `bad_backup`: it cannot be written there, or something that is no backup is there already.
+        BadInputError: kind `bad_backup`: it cannot be written there, or something that is no backup is there already;
+            `bad_store`: this user may not read the store.
         DamagedDataError: kind `damaged_store`: the store cannot be read.
     """
     source = folder / FILE_NAME
     if not source.is_file():
         raise NotFoundError("no_store", f"{folder} has no store; name the folder that `cairn serve --data` works on")
-    if target.exists() and (target.samefile(source) or not is_store(target)):
-        raise BadInputError("bad_backup", f"{target} is there and is no backup; choose another name")
+    try:
+        is_free = not target.exists()
+    except OSError as exc:
+        raise BadInputError("bad_backup", f"{target} cannot be written: {exc.strerror}") from exc
+    if not is_free and (target.samefile(source) or _version_of(target) not in range(1, len(STEPS) + 1)):
+        raise BadInputError("bad_backup", f"{target} is there and is no backup of this cairn's; choose another name")
     with _partial(target) as partial:
-        _copy(source, partial, report)
-    return target.stat().st_size
+        _copy(source, partial, report, shown=target)
+    size_bytes = target.stat().st_size
+    note_backup(folder, str(target.absolute()), size_bytes)
+    return size_bytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,20 +91,22 @@ def restore(
     Raises:
         NotFoundError: kind `no_store`: the file is not there.
         ConflictError: kind `store_in_use` or `not_empty`: a server works on the folder, or something is in it.
-        BadInputError: kind `bad_backup` or `store_version`: the file is no store that this version knows.
-        DamagedDataError: what `verify` finds.
+        BadInputError: kind `bad_backup` or `store_version`: the file is no store that this version knows; `bad_store`:
+            nothing can be written to the folder.
+        DamagedDataError: the file is cut off; or what `verify` finds.
     """
-    if not source.is_file():
-        raise NotFoundError("no_store", f"there is no file {source}")
-    if not is_store(source):
-        raise BadInputError("bad_backup", f"{source} is no backup of a cairn server")
-    folder.mkdir(0o700, parents=True, exist_ok=True)
-    with lock_folder(folder):
+    _check_backup(source)
+    try:
+        folder.mkdir(0o700, parents=True, exist_ok=True)
+        lock = lock_folder(folder)
+    except OSError as exc:
+        raise BadInputError("bad_store", f"cannot keep a store in {folder}: {exc.strerror}") from exc
+    with lock:
         found = sorted(path.name for path in folder.iterdir() if path.name not in (LOCK_NAME, LIST_NAME))
         if found:
             raise ConflictError("not_empty", f"{folder} is not empty, it has {found[0]}; restore into a new folder")
         with _partial(folder / FILE_NAME) as partial:
-            _copy(source, partial, report)
+            _copy(source, partial, report, shown=folder / FILE_NAME)
             _check_form(partial)
             _migrate(partial)
             verify(partial)
@@ -99,20 +118,42 @@ def restore(
     return restored
 
 
-def is_store(path: Path) -> bool:
-    """True if a file is a store of this version of cairn, or of an earlier one."""
+def _check_backup(path: Path) -> None:
+    """Refuse a file that is no whole backup which this version can read; raises as `restore`."""
+    try:
+        size_bytes = path.stat().st_size
+        with path.open("rb") as file:
+            head = file.read(HEAD.size)
+    except FileNotFoundError as exc:
+        raise NotFoundError("no_store", f"there is no file {path}") from exc
+    except OSError as exc:
+        raise BadInputError("bad_backup", f"{path} cannot be read: {exc.strerror}") from exc
+    if not head:
+        raise DamagedDataError("damaged_store", f"{path} is cut off: nothing of it is there; take another backup")
+    if len(head) == HEAD.size and head.startswith(MAGIC):
+        page_bytes, pages = HEAD.unpack(head)
+        whole_bytes = pages * (page_bytes if page_bytes > 1 else 1 << 16)
+        if size_bytes < whole_bytes:
+            there = f"{size_bytes / 1e6:.1f} of {whole_bytes / 1e6:.1f} MB ({100 * size_bytes // whole_bytes} %)"
+            raise DamagedDataError("damaged_store", f"{path} is cut off: {there} are there; take another backup")
+    version = _version_of(path)
+    if not version:
+        raise BadInputError("bad_backup", f"{path} is no backup of a cairn server")
+    if version > len(STEPS):
+        raise newer_store(f"the backup {path}", version)
+
+
+def _version_of(path: Path) -> int:
+    """Version of the store that a file is; 0 if it is none."""
     try:
         connection = _opened(path)
         try:
-            version = connection.pragma("user_version")
-            return 0 < version <= len(STEPS) and bool(
-                connection.execute("SELECT count(*) FROM sqlite_master WHERE name IN ('map', 'commits', 'log')").get
-                == 3
-            )
+            tables = "SELECT count(*) FROM sqlite_master WHERE name IN ('map', 'commits', 'log')"
+            return int(connection.pragma("user_version")) if connection.execute(tables).get == 3 else 0
         finally:
             connection.close()
     except apsw.Error:
-        return False
+        return 0
 
 
 def _opened(path: Path) -> apsw.Connection:
@@ -123,8 +164,17 @@ def _opened(path: Path) -> apsw.Connection:
     return connection
 
 
-def _copy(source: Path, target: Path, report: Report) -> None:
-    from_store = _opened(source)
+def _copy(source: Path, target: Path, report: Report, *, shown: Path | None = None) -> None:
+    """Copy one state of a store; `shown` is the target's name in messages.
+
+    Raises:
+        BadInputError: kind `bad_store`: the store cannot be opened; kind `bad_backup`: the target cannot be written.
+        DamagedDataError: kind `damaged_store`: the store cannot be read.
+    """
+    try:
+        from_store = _opened(source)
+    except apsw.Error as exc:
+        raise opening_failure(exc, source) from exc
     to_file = apsw.Connection(str(target))
     try:
         from_store.execute("BEGIN")
@@ -133,10 +183,10 @@ def _copy(source: Path, target: Path, report: Report) -> None:
             while not backup.done:
                 backup.step(STEP_PAGES)
                 report(backup.page_count - backup.remaining, backup.page_count)
-    except apsw.FullError as exc:
-        raise BadInputError("bad_backup", f"no room for {target.parent}: {exc}") from exc
     except apsw.Error as exc:
-        raise DamagedDataError("damaged_store", f"{source} cannot be copied: {exc}") from exc
+        if isinstance(exc, apsw.CorruptError | apsw.NotADBError) or getattr(exc, "extendedresult", 0) in UNREADABLE:
+            raise DamagedDataError("damaged_store", f"{source} cannot be copied: {exc}") from exc
+        raise _cannot_write(exc, target, shown or target) from exc
     finally:
         from_store.close()
         to_file.close()
@@ -221,11 +271,16 @@ def _partial(target: Path) -> Iterator[Path]:
         partial.replace(target)
         _sync(target.parent)
     except (OSError, apsw.Error) as exc:
-        raise BadInputError("bad_backup", f"{target} cannot be written: {exc}") from exc
+        raise _cannot_write(exc, partial, target) from exc
     finally:
         for side in SIDES:
             with suppress(OSError):
                 partial.with_name(partial.name + side).unlink(missing_ok=True)
+
+
+def _cannot_write(exc: apsw.Error | OSError, path: Path, shown: Path) -> BadInputError:
+    why = "its disk is full" if is_full(exc, path) else exc.strerror if isinstance(exc, OSError) else str(exc)
+    return BadInputError("bad_backup", f"{shown} cannot be written: {why}")
 
 
 def _sync(path: Path) -> None:

@@ -10,7 +10,7 @@ from cairn_map.commits.ids import Author
 from cairn_map.errors import UnreachableError
 from cairn_server.store.sqlite.readers import Readers
 from cairn_server.store.sqlite.writer import Writer, rows
-from cairn_server.store.store_rows import Branch, EntrySize, MapRow
+from cairn_server.store.store_rows import Branch, EntrySize, HeardRobot, MapRow
 
 
 class SqliteBranchNotes:
@@ -33,6 +33,15 @@ class SqliteBranchNotes:
         """Last status of each branch that ever reported one."""
         with self._readers.reading() as reader:
             return dict(rows(reader, "SELECT name, status FROM branch_status WHERE map = ?", (row.number,)))
+
+    def heard(self, *, limit: int) -> list[HeardRobot]:
+        """Robots of all maps by their last signs, the newest first."""
+        query = (
+            "SELECT map.name, branch.name, last_seen_s FROM branch JOIN map ON map.number = branch.map"
+            " ORDER BY last_seen_s DESC, 1, 2 LIMIT ?"
+        )
+        with self._readers.reading() as reader:
+            return [HeardRobot(*columns) for columns in rows(reader, query, (limit,))]
 
     def entry_sizes(self, row: MapRow, *, after_seq: int, limit: int) -> list[EntrySize]:
         """Log entries after one, oldest first, at most `limit`."""

@@ -340,9 +340,7 @@ def ensure_schema(connection: apsw.Connection) -> None:
     if version == len(STEPS):
         return
     if not 0 <= version < len(STEPS):
-        raise BadInputError(
-            "store_version", f"the store has version {version}; this cairn knows versions to {len(STEPS)}: update it"
-        )
+        raise newer_store("the store", version)
     if version == 0 and connection.execute("SELECT count(*) FROM sqlite_master").get:
         raise BadInputError("store_version", "the file is a database of another program")
     connection.execute("BEGIN IMMEDIATE")
@@ -352,3 +350,11 @@ def ensure_schema(connection: apsw.Connection) -> None:
         fill_tiles(connection)
     connection.execute(f"PRAGMA user_version = {len(STEPS)}")
     connection.execute("COMMIT")
+
+
+def newer_store(what: str, version: int) -> BadInputError:
+    """Error of a store, or a backup, that a newer program made."""
+    return BadInputError(
+        "store_version",
+        f"{what} is of a newer cairn: it has version {version}, this program knows versions to {len(STEPS)}; update it",
+    )

@@ -23,10 +23,11 @@ from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.store.admission import OWN_WORD, Grounds
 from cairn_server.store.branch_signs import LastSeen
 from cairn_server.store.folder_lock import lock_folder
+from cairn_server.store.private_files import close_to_others, make_private
 from cairn_server.store.sqlite.branches import SqliteBranchNotes, stored_branches
 from cairn_server.store.sqlite.changes import append_commit, heal_cell, next_number, write_fold
 from cairn_server.store.sqlite.ended_tokens import LIST_NAME, EndedTokens
-from cairn_server.store.sqlite.failures import disk_full
+from cairn_server.store.sqlite.failures import FULL, disk_full, opening_failure
 from cairn_server.store.sqlite.old_sums import measure_old_sums
 from cairn_server.store.sqlite.readers import Readers
 from cairn_server.store.sqlite.reads import SqliteReads
@@ -123,6 +124,8 @@ class SqliteStore(SqliteReads):
             folder.mkdir(0o700, parents=True, exist_ok=True)  # what is in it is as secret as the maps
             self._lock = lock_folder(folder)
         except OSError as exc:
+            if exc.errno in FULL:
+                raise opening_failure(exc, path) from exc
             raise BadInputError("bad_store", f"cannot keep a store in {folder}: {exc.strerror}") from exc
         try:
             self._ended = _prepare(path)
@@ -324,6 +327,10 @@ class SqliteStore(SqliteReads):
 def _prepare(path: Path) -> EndedTokens:
     """Bring the tables up to date, and open the list of ended tokens next to the store."""
     try:
+        # SQLite gives its files next to the store the mode of the store.
+        make_private(path)
+        for name in (f"{path.name}-wal", f"{path.name}-shm", LIST_NAME):
+            close_to_others(path.with_name(name))
         connection = connect(path)
         try:
             ensure_schema(connection)
@@ -331,8 +338,8 @@ def _prepare(path: Path) -> EndedTokens:
             return EndedTokens(path.with_name(LIST_NAME), connection)
         finally:
             connection.close()
-    except apsw.Error as exc:
-        raise BadInputError("bad_store", f"{path} is not a store, or cannot be opened: {exc}") from exc
+    except (apsw.Error, OSError) as exc:
+        raise opening_failure(exc, path) from exc
 
 
 class SqliteUses:

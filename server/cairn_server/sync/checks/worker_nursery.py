@@ -33,6 +33,7 @@ RETIRED_SHARE = 4
 def main(control_fd: int, memory_bytes: int) -> None:
     """Fork a worker for each socket that comes, until the server is gone."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # the kernel buries workers
     warm_up()
     with socket.socket(fileno=control_fd) as control:
