@@ -15,8 +15,10 @@ import time
 from dataclasses import dataclass
 from itertools import chain
 
+from cairn_map.errors import UnreachableError
 from cairn_server.access.cancellation import StopTime
 from cairn_server.access.rate_limits import ActLimit
+from cairn_server.access.wrong_tokens import WrongTokens
 from cairn_server.cell_room import DECODING
 from cairn_server.folding.cells import Cells
 from cairn_server.folding.damaged_cells import DamagedCells
@@ -36,6 +38,7 @@ from cairn_server.metrics import (
     memory_metrics,
     metrics_text,
     process_metrics,
+    ready_metrics,
     share_metrics,
     store_metrics,
     upstream_metrics,
@@ -54,6 +57,7 @@ from cairn_server.sync.retracting import Retracts
 from cairn_server.sync.uploads import Uploads
 from cairn_server.views.cell_views import CellViews
 from cairn_server.views.export_tickets import ExportTickets
+from cairn_server.views.hottest_search import HottestSearch
 from cairn_server.views.map_changes import MapChangesSearch
 from cairn_server.views.map_exports import MapExports
 from cairn_server.views.map_views import MapViews
@@ -86,6 +90,7 @@ class ViewParts:
     exports: MapExports
     tickets: ExportTickets
     changes: MapChangesSearch
+    hottest: HottestSearch
 
 
 class Service:
@@ -101,6 +106,7 @@ class Service:
         self.stop_time = StopTime()
         shared_uses = store.replicas.uses if store.replicas is not None else None
         self.acts = ActLimit(settings.quotas.acts_per_hour, shared=shared_uses)
+        self.wrong_tokens = WrongTokens(store)
         self.live = Hub(store, connections=settings.limit_concurrency)
         self.reports = RobotReports(store, self.live)
         self.fold_news = FoldNews()
@@ -148,6 +154,7 @@ class Service:
             exports,
             ExportTickets(store, settings, exports),
             MapChangesSearch(store, self.cells),
+            HottestSearch(store, self.cells),
         )
 
     def _sync_parts(self, upstream: UpstreamProgress) -> SyncParts:
@@ -211,7 +218,15 @@ class Service:
         memory = memory_metrics(self.settings.memory.limit_bytes)
         clock = clock_metrics(self.clock.doubt_s())
         counted = self.figures.registry.collect()
-        return metrics_text(chain(counted, store, shares, upstream, memory, clock, process_metrics()))
+        ready = ready_metrics(self._is_ready())
+        return metrics_text(chain(counted, ready, store, shares, upstream, memory, clock, process_metrics()))
+
+    def _is_ready(self) -> bool:
+        try:
+            self.readiness.check()
+        except UnreachableError:
+            return False
+        return True
 
     def stop_streams(self) -> None:
         """Count as not ready and end live streams, which never end alone; requests are still answered for a while."""

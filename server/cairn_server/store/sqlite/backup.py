@@ -6,10 +6,13 @@ write-ahead log. The copy has its name only when all of it is on the disk.
 """
 
 import os
+import shutil
+import tempfile
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 import apsw
 
@@ -37,14 +40,42 @@ def back_up(folder: Path, target: Path, report: Report) -> int:
         BadInputError: kind `bad_backup`: it cannot be written there, or something that is no backup is there already.
         DamagedDataError: kind `damaged_store`: the store cannot be read.
     """
-    source = folder / FILE_NAME
-    if not source.is_file():
-        raise NotFoundError("no_store", f"{folder} has no store; name the folder that `cairn serve --data` works on")
+    source = _store_in(folder)
     if target.exists() and (target.samefile(source) or not is_store(target)):
         raise BadInputError("bad_backup", f"{target} is there and is no backup; choose another name")
     with _partial(target) as partial:
         _copy(source, partial, report)
     return target.stat().st_size
+
+
+def send_backup(folder: Path, stream: BinaryIO, report: Report) -> int:
+    """Write a copy of the store of a folder to a stream; its size in bytes.
+
+    SQLite copies pages in an order of its own, into a file: the folder has room for the copy until all of it is sent.
+
+    Raises:
+        NotFoundError, DamagedDataError: as `back_up`.
+        BadInputError: kind `bad_backup`: there is no room for the copy, or the reader of the stream went away.
+    """
+    source = _store_in(folder)
+    try:
+        with tempfile.TemporaryDirectory(prefix="backup-", dir=folder) as name:
+            path = Path(name) / "copy"
+            _copy(source, path, report)
+            copy = path.open("rb")
+        with copy:
+            shutil.copyfileobj(copy, stream)
+            stream.flush()
+            return copy.tell()
+    except OSError as exc:
+        raise BadInputError("bad_backup", f"the backup is not whole, it cannot be written: {exc}") from exc
+
+
+def _store_in(folder: Path) -> Path:
+    source = folder / FILE_NAME
+    if not source.is_file():
+        raise NotFoundError("no_store", f"{folder} has no store; name the folder that `cairn serve --data` works on")
+    return source
 
 
 @dataclass(frozen=True, slots=True)
