@@ -91,7 +91,10 @@ def test_the_statuses_in_the_document_are_those_of_the_code(kind: str) -> None:
         ("counting an export's points", map_exports.COUNT_S),
         ("exports counted at once", map_exports.COUNTS_AT_ONCE),
         ("voxels in an answer about changes", map_changes.CHANGED_MAX),
-        ("known voxels of a cell and its neighbours, for the hottest voxels", hottest_search.VOXELS_MAX),
+        (
+            "memory for the cells of a search for the hottest voxels",
+            hottest_search.CELLS_BYTES,
+        ),
         ("looking for the hottest voxels", hottest_search.SEARCH_S),
         ("searches for changes at once", map_changes.SEARCHES_AT_ONCE),
         ("commits of a cell without epochs that are added up for its past", readings.PAST_ENTRIES_MAX),

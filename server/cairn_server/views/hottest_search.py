@@ -1,9 +1,9 @@
 """Search for the hottest voxels of a map, which reads the hottest cells alone.
 
 Each cell is kept with the temperature of its hottest voxel (`hottest_k`), which bounds all of its voxels. So cells are
-read from the hottest one on, each with its neighbours, because a voxel that was hit once counts as confirmed if it
-touches a surface; and the search ends when as many voxels are confirmed as are asked for, and none of the cells left
-could have a hotter one.
+read from the hottest one on, and next to them those of their neighbours that matter: a voxel that was hit once counts
+as confirmed if it touches a surface. The search ends when as many voxels are confirmed as are asked for, and none of
+the cells left could have a hotter one.
 """
 
 import time
@@ -13,10 +13,11 @@ from dataclasses import dataclass, field
 from itertools import product
 
 import numpy as np
+import numpy.typing as npt
 
 from cairn_map.evidence.brick_cell import BrickCell, brick_cell, reading_cell
-from cairn_map.evidence.channels import ChannelKind
-from cairn_map.evidence.grid import CELL_LIMIT, CellKey, Geometry, cell_key, cell_of_key
+from cairn_map.evidence.channels import Channel, ChannelKind
+from cairn_map.evidence.grid import CELL_LIMIT, CellKey, Geometry, cell_key, cell_of_key, voxels_in_cell
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.evidence.voxels import Voxels
 from cairn_map.files.export_request import ExportRequest, cell_may_have
@@ -30,16 +31,15 @@ from cairn_server.folding.cells import CellFaults, Cells
 from cairn_server.folding.cells_at_rest import DamagedCellError, sound_cell
 from cairn_server.store.store import Snapshot, Store
 from cairn_server.store.store_rows import CellRow, MapRow
-from cairn_server.views.readings import stored_reading
+from cairn_server.views.readings import stored_surface_reading
 
 SEARCH_S = 10.0
-VOXELS_MAX = 1 << 20
-"""Known voxels of the cells that are in memory at once, some 100 MB: where a cell and its neighbours have more, it is
-looked at alone."""
+CELLS_BYTES = 1 << 27
+"""Memory for the cells of one search: where a cell and its neighbours take more, it is looked at alone."""
 OCCUPIED_FROM = 0.5
 """Least probability of a voxel that counts."""
 ZERO_CELSIUS_K = 273.15
-AROUND = list(product((-1, 0, 1), repeat=3))
+Bools = npt.NDArray[np.bool_]
 
 
 class HottestSearch:
@@ -56,12 +56,12 @@ class HottestSearch:
             BadInputError: kind `bad_box`; `unknown_channel`: the map has no temperatures.
             DamagedCellError: kind `damaged_store`: a cell is damaged.
         """
-        first_of_kind(row.geometry, ChannelKind.TEMPERATURE)
+        channel = first_of_kind(row.geometry, ChannelKind.TEMPERATURE)
         asked = ExportRequest(box=box)
         asked.bounds_m()
         with self._cells.reading(row) as faults, self._store.snapshot(row) as snapshot:
             listed = {cell.key: cell for cell in snapshot.cells() if cell.voxels}
-            search = _Search(snapshot, row, asked, count, listed, faults)
+            search = _Search(snapshot, row, asked, count, listed, faults, channel)
             return search.answer(complete=search.run(end_s=time.monotonic() + SEARCH_S))
 
 
@@ -91,9 +91,11 @@ class _Search:
     listed: dict[CellKey, CellRow]
     """Cells of the snapshot that hold something."""
     faults: CellFaults
+    channel: Channel
+    """Of the temperatures."""
     kept: OrderedDict[CellKey, BrickCell] = field(default_factory=OrderedDict)
     """Cells that were decoded, those used last at the end."""
-    kept_voxels: int = 0
+    kept_bytes: int = 0
     sure: list[HotVoxel] = field(default_factory=list)
     doubtful: list[HotVoxel] = field(default_factory=list)
     searched: int = 0
@@ -119,31 +121,56 @@ class _Search:
 
     def _look(self, key: CellKey) -> bool:
         """Add the hottest voxels of a cell; False if its neighbours take too much memory, so that some are in doubt."""
-        around = self._around(key)
-        is_whole = sum(self.listed[each].voxels for each in around) <= VOXELS_MAX
-        part = _Part(self.row.geometry, {each: self._cell(each) for each in (around if is_whole else [key])})
-        low, high = self.asked.bounds_m()
-        voxels, are_sure = ranked_hottest(
-            freeze(part, self.row.sensor_model),
-            self.count,
-            min_probability=OCCUPIED_FROM,
-            box_m=np.stack([low, high]),
-            only=key,
-        )
-        for found, is_sure in ((self.sure, True), (self.doubtful, False)):
-            found += _hot_voxels(voxels.rows(np.nonzero(are_sure == is_sure)[0]), key, confirmed=is_sure)
-            found.sort(key=lambda voxel: -voxel.mean)
-            del found[self.count :]
         self.searched += 1
-        return is_whole
+        cells = {key: self._cell(key)}
+        alone = self._with(key, self._ranked(key, cells))
+        # A voxel at the border may touch a surface of the next cell: then it counts before all that are in doubt.
+        sure = alone[0]
+        wanted = self._beyond_border(key, cells[key], sure[-1].mean if len(sure) == self.count else -np.inf)
+        size_bytes = cells[key].size_bytes
+        for each in wanted:
+            cell = self._cell(each)
+            size_bytes += cell.size_bytes
+            if size_bytes > CELLS_BYTES:
+                self.sure, self.doubtful = alone
+                return False
+            cells[each] = cell
+        self.sure, self.doubtful = self._with(key, self._ranked(key, cells)) if wanted else alone
+        return True
 
-    def _around(self, key: CellKey) -> list[CellKey]:
-        """A cell and its neighbours that hold something."""
-        around = (np.array(cell_of_key(key)) + np.array(AROUND)).tolist()
-        inside = (each for each in around if all(-CELL_LIMIT <= n < CELL_LIMIT for n in each))
-        return [found for each in inside if (found := cell_key(tuple(each))) in self.listed]
+    def _ranked(self, key: CellKey, cells: Mapping[CellKey, BrickCell]) -> tuple[Voxels, Bools]:
+        """Hottest voxels of a cell, and which of them are confirmed by what these cells hold."""
+        part, (low, high) = _Part(self.row.geometry, cells), self.asked.bounds_m()
+        frozen = freeze(part, self.row.sensor_model)
+        box_m = np.stack([low, high])
+        return ranked_hottest(frozen, self.count, min_probability=OCCUPIED_FROM, box_m=box_m, only=key)
+
+    def _with(self, key: CellKey, ranked: tuple[Voxels, Bools]) -> tuple[list[HotVoxel], list[HotVoxel]]:
+        """The hottest confirmed voxels, and the others, of all cells so far and this one."""
+        voxels, are_sure = ranked
+        rows = np.nonzero(are_sure)[0], np.nonzero(~are_sure)[0]
+        sure = [*self.sure, *_hot_voxels(voxels.rows(rows[0]), key, confirmed=True)]
+        doubtful = [*self.doubtful, *_hot_voxels(voxels.rows(rows[1]), key, confirmed=False)]
+        first, second = (sorted(some, key=lambda voxel: -voxel.mean)[: self.count] for some in (sure, doubtful))
+        return first, second
+
+    def _beyond_border(self, key: CellKey, cell: BrickCell, least_k: float) -> list[CellKey]:
+        """Neighbours of the voxels of a cell that were hit once, are hotter than this, and lie at its border."""
+        evidence, geometry = cell.packed(), self.row.geometry
+        planes = geometry.planes_of(self.channel.name)
+        sums = evidence.samples[:, planes]
+        weights = np.maximum(sums[:, -1], 1)
+        kelvin = self.channel.zero + self.channel.step * sums[:, 0] / weights
+        wanted = (sums[:, -1] > 0) & (evidence.counts[evidence.sampled][:, 0] <= 1) & (kelvin > least_k)
+        local = voxels_in_cell(evidence.voxels[evidence.sampled[wanted]], key, geometry) % geometry.side
+        sides = np.unique((local == geometry.side - 1).astype(np.int64) - (local == 0), axis=0).tolist()
+        steps = {step for side in sides for step in product(*({0, each} for each in side)) if any(step)}
+        near = (tuple(a + b for a, b in zip(cell_of_key(key), step, strict=True)) for step in sorted(steps))
+        inside = ((i, j, k) for i, j, k in near if all(-CELL_LIMIT <= n < CELL_LIMIT for n in (i, j, k)))
+        return [found for each in inside if (found := cell_key(each)) in self.listed]
 
     def _cell(self, key: CellKey) -> BrickCell:
+        """Occupied voxels of a cell, and those with samples."""
         if key in self.kept:
             self.kept.move_to_end(key)
             return self.kept[key]
@@ -152,15 +179,18 @@ class _Search:
         if stored is None:
             raise DamagedCellError(key, "a cell is listed, but is not there")
         with DECODING.of_cell(row.geometry, stored.voxels):
-            evidence = stored_reading(stored, row)
+            evidence = stored_surface_reading(stored, row)
+            keep = evidence.occupied(row.sensor_model)
+            keep[evidence.sampled] = True
+            evidence = evidence.where(keep)
             if evidence.odds is None:
                 made = brick_cell(row.geometry, [evidence])
             else:
                 made = reading_cell(row.geometry, evidence, row.sensor_model)
         self.kept[key] = made
-        self.kept_voxels += self.listed[key].voxels
-        while self.kept_voxels > VOXELS_MAX and len(self.kept) > 1:
-            self.kept_voxels -= self.listed[self.kept.popitem(last=False)[0]].voxels
+        self.kept_bytes += made.size_bytes
+        while self.kept_bytes > CELLS_BYTES and len(self.kept) > 1:
+            self.kept_bytes -= self.kept.popitem(last=False)[1].size_bytes
         return made
 
 

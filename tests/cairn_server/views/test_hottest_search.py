@@ -105,11 +105,13 @@ def test_a_surface_in_the_next_cell_confirms_a_voxel_at_the_border(live: Live) -
 
 
 def test_what_a_bound_ended_says_so(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
-    row = map_of(live, ([(3, 3, 3)], 2, 400.0), ([(4, 3, 3)], 2, 310.0))
+    side = GEOMETRY.side
+    next_door = [(side, y, 5) for y in (4, 5, 6)]
+    row = map_of(live, ([(side - 1, 5, 5)], 1, 350.0), (next_door, 1, 300.0))
     with monkeypatch.context() as small:
-        small.setattr(hottest_search, "VOXELS_MAX", 1)
-        alone = asked(live, row, count=5)
-    assert (len(alone.voxels), alone.complete) == (2, False)
+        small.setattr(hottest_search, "CELLS_BYTES", 1)
+        alone = asked(live, row, count=1)
+    assert (alone.complete, [v.confirmed for v in alone.voxels]) == (False, [False])
     monkeypatch.setattr(hottest_search, "SEARCH_S", -1.0)
     late = asked(live, row, count=5)
     assert (late.voxels, late.complete, late.searched) == ([], False, 0)
