@@ -92,7 +92,7 @@ class _Search:
     """Cells of the snapshot that hold something."""
     faults: CellFaults
     channel: Channel
-    """Of the temperatures."""
+    """Channel of the temperatures."""
     kept: OrderedDict[CellKey, BrickCell] = field(default_factory=OrderedDict)
     """Cells that were decoded, those used last at the end."""
     kept_bytes: int = 0
