@@ -104,6 +104,7 @@ def test_an_exception_is_told_in_either_form() -> None:
 @pytest.mark.processes
 def test_every_line_is_json_from_the_first_to_the_last(tmp_path: Path) -> None:
     (tmp_path / "admin").write_text(ADMIN)
+    (tmp_path / "admin").chmod(0o600)
     options = ("--admin-token-file", str(tmp_path / "admin"), "--log-format", "json")
     first = subprocess.Popen(
         [sys.executable, "-m", "cairn_client.main", "serve", "--data", str(tmp_path / "data"), "--port", "0", *options],
@@ -112,7 +113,8 @@ def test_every_line_is_json_from_the_first_to_the_last(tmp_path: Path) -> None:
         text=True,
     )
     assert first.stdout is not None
-    started = json.loads(first.stdout.readline())
+    announced, started = (json.loads(first.stdout.readline()) for _ in range(2))
+    assert "is new, and so is the store" in announced["message"]
     with httpx.Client(base_url=started["url"]) as http:
         assert http.get("/maps", headers={"Authorization": f"Bearer {WRONG}"}).status_code == 401
     with socket.create_connection(("127.0.0.1", int(started["url"].rpartition(":")[2])), timeout=60) as link:

@@ -135,7 +135,7 @@ def test_a_backup_goes_into_a_pipe_and_comes_back_from_it(live: Live, row: MapRo
     with file.open("wb") as out:
         done = in_process("backup", "--data", str(tmp_path / "data"), "-", stdout=out)
     assert (done.returncode, done.stderr.count("standard output: 0.")) == (0, 1), done.stderr
-    assert sorted(path.name for path in (tmp_path / "data").iterdir() if "backup" in path.name) == []
+    assert sorted(path.name for path in (tmp_path / "data").iterdir() if "backup" in path.name) == ["last-backup"]
     assert main(["restore", str(file), "--data", str(tmp_path / "restored")]) == 0
     with Live(tmp_path / "restored") as other:
         assert read(other.cells(other.service.store.map(row.name))) == sum_of(COMMITS)
