@@ -113,7 +113,7 @@ ROOMS = {
     "cairn_sim": "scene render robots evaluation experiment study demo sim_command warm_up",
     "cairn_server": """
         memory_shares cell_room settings processes
-        store store.objects store.sqlite store.postgres store.settling
+        store store.objects store.sqlite store.sqlite.files store.postgres store.settling
         metrics access live folding sync.checks sync views maps service
         http.middleware http.routes http operations
     """,

@@ -40,6 +40,18 @@ class MapRow:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class GoneMap:
+    """A map that an administrator deleted; its number is given to no other one, its name may be."""
+
+    number: int
+    name: str
+    deleted_s: float
+    """Time of the deletion, UTC seconds since 1970."""
+    by: str
+    """Name of the token by which it was deleted."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class NewCommit:
     """A validated commit on its way into the store."""
 
@@ -220,6 +232,10 @@ class HeardRobot:
     """Time of the sign, UTC seconds since 1970."""
 
 
+LOG_ENTRY_BYTES = 500
+"""About the bytes of a log entry and of what is kept of its commit for ever, with their indexes."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Totals:
     """Sizes of a map."""
@@ -231,6 +247,8 @@ class Totals:
     corner_cells: tuple[tuple[int, int, int], tuple[int, int, int]] | None = None
     history_bytes: int = 0
     """Bytes, of `size_bytes`, of rows that are older than the newest one of their cell."""
+    evidence_bytes: int = 0
+    """Bytes of the commits whose evidence is kept, as they were pushed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -351,6 +369,12 @@ class StoreFigures:
     """Bytes of the cells of all maps."""
     history_bytes: int
     """Bytes, of these, of rows that are older than the newest one of their cell."""
+    evidence_bytes: int
+    """Bytes of the commits of all maps whose evidence is kept."""
+    log_entries: int
+    """Log entries of all maps."""
+    unused_bytes: int
+    """Bytes of the store's file that nothing uses."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
