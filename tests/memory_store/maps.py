@@ -13,9 +13,9 @@ from contextlib import contextmanager
 from tests.memory_store.map import MemoryMap
 
 from cairn_map.errors import UnreachableError
-from cairn_server.store.map_refusals import map_gone, no_map
+from cairn_server.map_refusals import GoneMap, map_gone, no_map
 from cairn_server.store.replica_notes import FoldHint, OnHint
-from cairn_server.store.store_rows import GoneMap, MapRow
+from cairn_server.store.store_rows import MapRow
 
 
 class MemoryMaps:

@@ -25,12 +25,12 @@ from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import CairnError, NotFoundError, UnreachableError
 from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
+from cairn_server.map_refusals import GoneMap, check_same_map
 from cairn_server.store.admission import OWN_WORD, Grounds
-from cairn_server.store.map_refusals import check_same_map
 from cairn_server.store.replica_notes import FoldHint, ReplicaNotes
 from cairn_server.store.store import Store
 from cairn_server.store.store_age import CLOCKS, AgeMark, Clocks, StoreAge
-from cairn_server.store.store_rows import Branch, Fold, GoneMap, MapRow, NewCommit, StoredCommit
+from cairn_server.store.store_rows import Branch, Fold, MapRow, NewCommit, StoredCommit
 
 log = logging.getLogger(__name__)
 

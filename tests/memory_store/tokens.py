@@ -10,9 +10,9 @@ from tests.memory_store.maps import MemoryMaps
 
 from cairn_map.errors import ConflictError, NotFoundError, UnreachableError
 from cairn_map.wire.access_messages import AuditEntry, audit_chain
-from cairn_server.store.map_refusals import map_gone
+from cairn_server.map_refusals import GoneMap, map_gone
 from cairn_server.store.store_age import StoreAge
-from cairn_server.store.store_rows import GoneMap, MapRow, Token, registration_name
+from cairn_server.store.store_rows import MapRow, Token, registration_name
 
 log = logging.getLogger(__name__)
 

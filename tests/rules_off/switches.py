@@ -1031,7 +1031,7 @@ SWITCHES = (
     Switch(
         16,
         "evidence that the upstream lacks is not forgotten",
-        "server/cairn_server/store/upkeep.py",
+        "server/cairn_server/upkeep.py",
         "may_s = min(before_s, self._may_forget_s(row.name))",
         "may_s = before_s",
         "cairn_client/relay/test_relay.py::test_a_field_server_forgets_nothing_that_its_upstream_has_not_got",

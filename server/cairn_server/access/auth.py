@@ -20,8 +20,8 @@ from enum import StrEnum
 
 from cairn_map.commits.ids import SERVERS_OWN, RobotName
 from cairn_map.errors import BadInputError, DeniedError
+from cairn_server.map_refusals import map_gone
 from cairn_server.settings import Settings
-from cairn_server.store.map_refusals import map_gone
 from cairn_server.store.store import Store
 from cairn_server.store.store_rows import MapRow, Token
 

@@ -16,7 +16,7 @@ from cairn_server.folding.group_folding import GROUP_MAX, Folded, LocalFolding
 from cairn_server.folding.readiness import FoldHealth
 from cairn_server.store.store import Store
 from cairn_server.store.store_rows import MapRow
-from cairn_server.store.upkeep import Upkeep
+from cairn_server.upkeep import Upkeep
 
 log = logging.getLogger(__name__)
 

@@ -20,6 +20,7 @@ from cairn_map.evidence.grid import CellKey, Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.wire.access_messages import AuditEntry
 from cairn_map.wire.messages import LogEntry
+from cairn_server.map_refusals import GoneMap
 from cairn_server.store.admission import OWN_WORD, Grounds, RobotKey
 from cairn_server.store.replica_notes import ReplicaNotes
 from cairn_server.store.store_age import StoreAge
@@ -33,7 +34,6 @@ from cairn_server.store.store_rows import (
     Contribution,
     EntrySize,
     Fold,
-    GoneMap,
     HeardRobot,
     MapRow,
     NamedCommit,

@@ -40,18 +40,6 @@ class MapRow:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class GoneMap:
-    """A map that an administrator deleted; its number is given to no other one, its name may be."""
-
-    number: int
-    name: str
-    deleted_s: float
-    """Time of the deletion, UTC seconds since 1970."""
-    by: str
-    """Name of the token by which it was deleted."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class NewCommit:
     """A validated commit on its way into the store."""
 

@@ -6,8 +6,7 @@ import psycopg
 from psycopg import errors
 
 from cairn_map.errors import BadInputError, CairnError, DamagedDataError, NotFoundError, UnreachableError
-from cairn_server.store.map_refusals import map_gone, no_map
-from cairn_server.store.store_rows import GoneMap
+from cairn_server.map_refusals import GoneMap, map_gone, no_map
 
 _Connection = psycopg.Connection[tuple[Any, ...]]
 

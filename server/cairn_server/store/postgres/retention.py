@@ -12,12 +12,13 @@ comes after those that are removed. Servers that have the map in memory are refu
 """
 
 from cairn_map.commits.ids import Author, CommitId
+from cairn_server.map_refusals import GoneMap
 from cairn_server.store.numbering import AGAIN_KEPT_S, EvidenceGoneError
 from cairn_server.store.postgres.connections import Connection, first, rows
 from cairn_server.store.postgres.failures import lost_map
 from cairn_server.store.postgres.schema import IS_WAITING, NOW_S
 from cairn_server.store.postgres.shares import lock_head
-from cairn_server.store.store_rows import GoneMap, MapRow, NewCommit
+from cairn_server.store.store_rows import MapRow, NewCommit
 
 DROP_DIFFS = """
 WITH went AS (

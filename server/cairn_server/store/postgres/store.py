@@ -16,8 +16,8 @@ from cairn_map.errors import ConflictError, UnreachableError
 from cairn_map.evidence.fingerprint import ZERO
 from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
+from cairn_server.map_refusals import GoneMap, check_same_map
 from cairn_server.store.admission import OWN_WORD, Grounds
-from cairn_server.store.map_refusals import check_same_map
 from cairn_server.store.objects.cold_bytes import ColdReads
 from cairn_server.store.postgres.branches import PgBranches
 from cairn_server.store.postgres.connections import NOTING, Connection, Connections, first
@@ -36,7 +36,7 @@ from cairn_server.store.postgres.writing_threads import WritingThreads
 from cairn_server.store.replica_notes import SERVER_S
 from cairn_server.store.store_age import CLOCKS, AgeMark, Clocks, StoreAge
 from cairn_server.store.store_clock import ClockMark, clock_mark_from_text
-from cairn_server.store.store_rows import Branch, Fold, GoneMap, MapRow, NewCommit
+from cairn_server.store.store_rows import Branch, Fold, MapRow, NewCommit
 
 log = logging.getLogger(__name__)
 

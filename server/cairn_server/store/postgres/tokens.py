@@ -8,13 +8,14 @@ from dataclasses import dataclass, field
 
 from cairn_map.errors import ConflictError
 from cairn_map.wire.access_messages import AuditEntry, audit_chain
+from cairn_server.map_refusals import GoneMap
 from cairn_server.store.known_tokens import KnownTokens, check_changed, token_row
 from cairn_server.store.postgres.connections import Connection, Connections, first, rows
 from cairn_server.store.postgres.failures import gone_of_token, lost_map
 from cairn_server.store.postgres.schema import NOW_S
 from cairn_server.store.postgres.writing_threads import WritingThreads
 from cairn_server.store.store_age import StoreAge
-from cairn_server.store.store_rows import GoneMap, MapRow, Token, registration_name
+from cairn_server.store.store_rows import MapRow, Token, registration_name
 
 log = logging.getLogger(__name__)
 

@@ -20,11 +20,11 @@ import apsw
 
 from cairn_map.commits.ids import CommitId
 from cairn_map.errors import NotFoundError
-from cairn_server.store.map_refusals import map_gone, no_map
+from cairn_server.map_refusals import GoneMap, map_gone, no_map
 from cairn_server.store.numbering import AGAIN_KEPT_S, EvidenceGoneError
 from cairn_server.store.sqlite.ended_tokens import EndedTokens
 from cairn_server.store.sqlite.writer import Values, first, rows
-from cairn_server.store.store_rows import GoneMap, MapRow, NewCommit
+from cairn_server.store.store_rows import MapRow, NewCommit
 
 
 def forget_evidence(connection: apsw.Connection, row: MapRow, before_s: float, limit: int, *, age_s: float) -> int:

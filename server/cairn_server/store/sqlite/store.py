@@ -20,10 +20,10 @@ from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import BadInputError, NotFoundError, UnreachableError
 from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
+from cairn_server.map_refusals import GoneMap, check_same_map
 from cairn_server.store.admission import OWN_WORD, Grounds
 from cairn_server.store.branch_signs import LastSeen
 from cairn_server.store.folder_lock import lock_folder
-from cairn_server.store.map_refusals import check_same_map
 from cairn_server.store.private_files import close_to_others, make_private
 from cairn_server.store.sqlite.branches import SqliteBranchNotes, stored_branches
 from cairn_server.store.sqlite.changes import append_commit, heal_cell, next_number, write_fold
@@ -60,7 +60,6 @@ from cairn_server.store.store_rows import (
     Branch,
     CellRow,
     Fold,
-    GoneMap,
     MapRow,
     NewCommit,
     Robot,

@@ -10,13 +10,14 @@ import apsw
 
 from cairn_map.errors import ConflictError, UnreachableError
 from cairn_map.wire.access_messages import AuditEntry, audit_chain
+from cairn_server.map_refusals import GoneMap
 from cairn_server.store.known_tokens import KnownTokens, check_changed, token_row
 from cairn_server.store.sqlite.ended_tokens import EndedTokens
 from cairn_server.store.sqlite.readers import Readers
 from cairn_server.store.sqlite.retention import check_lives, gone_of_token
 from cairn_server.store.sqlite.writer import Writer, first, rows
 from cairn_server.store.store_age import StoreAge
-from cairn_server.store.store_rows import GoneMap, MapRow, Token, registration_name
+from cairn_server.store.store_rows import MapRow, Token, registration_name
 
 log = logging.getLogger(__name__)
 

@@ -12,7 +12,7 @@ from tests.memory_store.store import MemoryStore
 from cairn_map.errors import UnreachableError
 from cairn_server.store.store_age import Clocks
 from cairn_server.store.store_rows import MapRow
-from cairn_server.store.upkeep import LEAST_LOOK_S, LOOK_EVERY_S, RETRY_S, Upkeep
+from cairn_server.upkeep import LEAST_LOOK_S, LOOK_EVERY_S, RETRY_S, Upkeep
 
 FOREVER_S = float("inf")
 

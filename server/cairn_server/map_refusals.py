@@ -1,11 +1,23 @@
 """Refusals that concern a map as a whole: its name is taken by another one, was never given, or it was deleted."""
 
+from dataclasses import dataclass
 from datetime import UTC, datetime
 
 from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import ConflictError, NotFoundError
 from cairn_map.evidence.inverse_sensor_model import SensorModel
-from cairn_server.store.store_rows import GoneMap
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GoneMap:
+    """A map that an administrator deleted; its number is given to no other one, its name may be."""
+
+    number: int
+    name: str
+    deleted_s: float
+    """Time of the deletion, UTC seconds since 1970."""
+    by: str
+    """Name of the token by which it was deleted."""
 
 
 def map_gone(gone: GoneMap) -> NotFoundError:
