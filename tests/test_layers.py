@@ -112,9 +112,9 @@ ROOMS = {
     "cairn_client": "replica sync http relay robot folders cli cli.maps cli.robots main",
     "cairn_sim": "scene render robots evaluation experiment study demo sim_command warm_up",
     "cairn_server": """
-        memory_shares cell_room settings processes
-        store store.objects store.sqlite store.postgres store.settling
-        metrics access live folding sync.checks sync views maps service
+        memory_shares cell_room settings processes map_refusals
+        store store.objects store.sqlite store.sqlite.files store.postgres store.settling
+        metrics access live upkeep folding sync.checks sync views maps service
         http.middleware http.routes http operations
     """,
 }

@@ -256,6 +256,10 @@ def test_commands_of_the_page_for_administrators_run(page: Page, monkeypatch: py
         page.serve("HOST", "--data", "NEW")
         page.name("HOST", "base")
 
+    def archive() -> None:
+        cairn(*page.here(["map", "create", "http://HOST:8750/maps/attic"]), folder=folder)
+        cairn("serve", "archive", "attic", "attic.cairn", "--data", "NEW", folder=folder)
+
     def create_relay() -> None:
         command = page.here(["token", "create", "http://base:8750", "field1", "--role", "relay"])
         (folder / "field" / "field1.secret").write_text(cairn(*command, folder=folder))
@@ -285,6 +289,7 @@ def test_commands_of_the_page_for_administrators_run(page: Page, monkeypatch: py
             ),
             "serve backup --data DIR -": send_backup,
             "serve --data NEW": serve_restored,
+            "serve archive attic attic.cairn --data DIR": archive,
             "token create http://base:8750 field1 --role relay": create_relay,
             upstream: serve_field,
         },

@@ -9,13 +9,14 @@ import logging
 import time
 from bisect import bisect_right
 from collections import defaultdict
+from collections.abc import Callable
 from itertools import accumulate
 
 from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.ids import robot_name
 from cairn_map.errors import BadInputError
 from cairn_map.wire.live_events import RobotSign
-from cairn_map.wire.messages import BranchInfo, CreateMap, MapInfo, Register, Registered
+from cairn_map.wire.messages import BranchInfo, CreateMap, MapDeleted, MapInfo, MapSizes, Register, Registered
 from cairn_server.access.auth import check_robot_name, new_token, token_hash
 from cairn_server.cell_room import check_geometry
 from cairn_server.live.hub import Hub
@@ -24,7 +25,7 @@ from cairn_server.live.robot_reports import RobotReports
 from cairn_server.memory_shares import MemoryShares
 from cairn_server.store.admission import OWN_WORD, Grounds
 from cairn_server.store.store import Store
-from cairn_server.store.store_rows import Branch, EntrySize, MapRow
+from cairn_server.store.store_rows import LOG_ENTRY_BYTES, Branch, EntrySize, MapRow
 from cairn_server.sync.handing_over import server_key
 
 log = logging.getLogger(__name__)
@@ -35,8 +36,18 @@ LAG_ENTRIES_MAX = 10_000
 class Maps:
     """Maps of a store and the robots registered on them; called from many threads."""
 
-    def __init__(self, store: Store, hub: Hub, reports: RobotReports, shares: MemoryShares) -> None:
+    def __init__(
+        self,
+        store: Store,
+        hub: Hub,
+        reports: RobotReports,
+        shares: MemoryShares,
+        *,
+        on_delete: Callable[[], None] = lambda: None,
+    ) -> None:
+        """`on_delete` is called when there are rows of a deleted map to be removed."""
         self._store = store
+        self._on_delete = on_delete
         self._shares = shares
         self._hub = hub
         self._reports = reports
@@ -52,6 +63,17 @@ class Maps:
             check_geometry(request.geometry, self._shares)
         row, is_new = self._store.create_map(robot_name(name), request.geometry, request.sensor_model, request.epoch_s)
         return self.info(row), is_new
+
+    def delete(self, row: MapRow, *, by: str) -> MapDeleted:
+        """Delete a map for good: its tokens end, its listeners are sent away, its rows go in the background.
+
+        Raises:
+            NotFoundError: kind `gone`: it was deleted already.
+        """
+        gone = self._store.delete_map(row, by=by)
+        self._hub.map_gone(row)
+        self._on_delete()
+        return MapDeleted(name=gone.name, deleted_s=gone.deleted_s)
 
     def warn_of_large_cells(self) -> None:
         """Log each map that was made while this server had more memory for a cell."""
@@ -86,6 +108,18 @@ class Maps:
             server_key=server_key(row).public_key.hex(),
             epoch_s=row.epoch_s,
             history_bytes=totals.history_bytes,
+        )
+
+    def sizes(self, row: MapRow) -> MapSizes:
+        """Bytes of a map, by what they are for; nothing of the map is read through."""
+        with self._store.snapshot(row) as snapshot:
+            totals, entries = snapshot.totals(), snapshot.head.seq
+        return MapSizes(
+            present_bytes=totals.size_bytes - totals.history_bytes,
+            history_bytes=totals.history_bytes,
+            evidence_bytes=totals.evidence_bytes,
+            log_bytes=LOG_ENTRY_BYTES * entries,
+            log_entries=entries,
         )
 
     def register(self, row: MapRow, request: Register, grounds: Grounds = OWN_WORD) -> Registered:

@@ -26,7 +26,7 @@ from prometheus_client.registry import Collector
 from cairn_map.wire.empty_cell_frames import EmptyCellFrames
 from cairn_map.wire.frames import CellFrame, Frame
 from cairn_server.processes import used_bytes
-from cairn_server.store.store_rows import Backlog, HeardRobot, StoreFigures, UsedPart
+from cairn_server.store.store_rows import LOG_ENTRY_BYTES, Backlog, HeardRobot, StoreFigures, UsedPart
 
 MEDIA_TYPE = CONTENT_TYPE_PLAIN_0_0_4
 SERIES_MAX = 2000
@@ -160,6 +160,11 @@ def store_metrics(found: StoreFigures, backlogs: list[Backlog], at_work: Collect
     cells.add_metric(["present"], found.cells_bytes - found.history_bytes)
     cells.add_metric(["history"], found.history_bytes)
     yield cells
+    evidence = "Size of the commits of all maps whose evidence is kept."
+    yield GaugeMetricFamily("cairn_evidence_size_bytes", evidence, found.evidence_bytes)
+    log_bytes = LOG_ENTRY_BYTES * found.log_entries
+    yield GaugeMetricFamily("cairn_log_size_bytes", "Size of the logs of all maps, about.", log_bytes)
+    yield GaugeMetricFamily("cairn_store_unused_bytes", "Part of the store that nothing uses.", found.unused_bytes)
     yield GaugeMetricFamily("cairn_wal_size_bytes", "Size of what the store wrote ahead.", found.ahead_bytes)
     if found.free_bytes is not None:
         yield GaugeMetricFamily("cairn_disk_free_bytes", "Free space on the store's disk.", found.free_bytes)

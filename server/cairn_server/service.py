@@ -133,7 +133,7 @@ class Service:
                 self.site,
                 look_at_clock=self.clock.look,
             )
-        self.maps = Maps(store, self.live, self.reports, settings.memory)
+        self.maps = Maps(store, self.live, self.reports, settings.memory, on_delete=self._clear_deleted)
         self.maps.warn_of_large_cells()
 
         DECODING.limit_bytes = settings.memory.decoding_bytes
@@ -200,6 +200,12 @@ class Service:
 
     def _wake_folding(self) -> None:
         if self._fold_thread is not None:
+            self._fold_thread.wake()
+
+    def _clear_deleted(self) -> None:
+        """Begin to remove the rows of a map that was deleted."""
+        if self._fold_thread is not None:
+            self._fold_thread.upkeep.hurry()
             self._fold_thread.wake()
 
     def _folds(self) -> bool:

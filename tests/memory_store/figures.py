@@ -8,7 +8,7 @@ from tests.memory_store.map import MemoryMap
 from tests.memory_store.maps import MemoryMaps
 
 from cairn_map.commits.cursor import ENTRY_FOLD
-from cairn_map.errors import UnreachableError
+from cairn_map.errors import NotFoundError, UnreachableError
 from cairn_server.store.shares import full_authors
 from cairn_server.store.store_age import StoreAge
 from cairn_server.store.store_rows import (
@@ -56,10 +56,17 @@ class MemoryHealth:
                 failures={},
                 cells_bytes=sum(cell.size_bytes for cell in cells),
                 history_bytes=sum(cell.history_bytes for cell in cells),
+                evidence_bytes=sum(state.evidence_bytes() for state in maps.values()),
+                log_entries=sum(state.head.seq for state in maps.values()),
+                unused_bytes=0,
             )
 
     def check_space(self, free_bytes_min: int) -> None:
         """Refuse nothing: there is no disk."""
+
+    def shrink(self) -> bool:
+        """Nothing: there is no file."""
+        return False
 
     def heal(self, row: MapRow, cell: CellRow) -> bool:
         """Put sound bytes in the place of a damaged cell; False if it changed meanwhile."""
@@ -139,7 +146,7 @@ class MemoryNotes:
 
     def put_status(self, row: MapRow, branch: str, status: str) -> None:
         """Keep the last status of a branch, as JSON, if there is such a branch."""
-        with suppress(UnreachableError), self._maps.changing(row) as changed:  # the next one comes soon
+        with suppress(UnreachableError, NotFoundError), self._maps.changing(row) as changed:  # the next one comes soon
             if branch in changed.branches:
                 changed.statuses[branch] = status
 

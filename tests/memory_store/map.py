@@ -121,6 +121,10 @@ class MemoryMap:
                 setattr(other, name, value.copy())
         return other
 
+    def evidence_bytes(self) -> int:
+        """Bytes of the commits whose evidence is kept."""
+        return sum(kept.new.size_bytes for kept in self.commits.values() if not kept.is_gone)
+
     def append(self, commit: NewCommit, *, age_s: float) -> bool:
         """Keep a commit at an age of the store; False if the same one is known already."""
         known = self.commits.get(commit.id)

@@ -12,7 +12,8 @@ from contextlib import contextmanager
 
 from tests.memory_store.map import MemoryMap
 
-from cairn_map.errors import NotFoundError, UnreachableError
+from cairn_map.errors import UnreachableError
+from cairn_server.map_refusals import GoneMap, map_gone, no_map
 from cairn_server.store.replica_notes import FoldHint, OnHint
 from cairn_server.store.store_rows import MapRow
 
@@ -23,6 +24,10 @@ class MemoryMaps:
     def __init__(self) -> None:
         self._lock = threading.RLock()
         self._maps: dict[str, MemoryMap] = {}
+        self.gone: list[GoneMap] = []
+        """Deleted maps, oldest first."""
+        self.made = 0
+        """Count of the maps that ever were."""
         self._is_closed = False
         self.written = 0
         """Changes since the start."""
@@ -44,13 +49,13 @@ class MemoryMaps:
     def reading(self, row: MapRow) -> Iterator[MemoryMap]:
         """A map, while nobody changes it."""
         with self.locked() as maps:
-            yield _found(maps, row.name)
+            yield self._found(maps, row)
 
     @contextmanager
     def changing(self, row: MapRow) -> Iterator[MemoryMap]:
         """A map's dictionaries, which no snapshot has."""
         with self.locked() as maps:
-            state = _found(maps, row.name)
+            state = self._found(maps, row)
             if state.is_shared:
                 state = maps[row.name] = state.copied()
             yield state
@@ -60,10 +65,19 @@ class MemoryMaps:
         """The map of a name.
 
         Raises:
-            NotFoundError: kind `no_map`.
+            NotFoundError: kind `no_map` or `gone`.
         """
         with self.locked() as maps:
-            return _found(maps, name).row
+            if name in maps:
+                return maps[name].row
+            gone = next((gone for gone in reversed(self.gone) if gone.name == name), None)
+            raise no_map(name) if gone is None else map_gone(gone)
+
+    def _found(self, maps: dict[str, MemoryMap], row: MapRow) -> MemoryMap:
+        for gone in self.gone:
+            if gone.number == row.number:
+                raise map_gone(gone)
+        return maps[row.name]
 
     def shared(self, row: MapRow) -> MemoryMap:
         """A map's dictionaries as they are now; nobody changes them from then on."""
@@ -88,9 +102,3 @@ class MemoryMaps:
         """Answer nothing any more."""
         with self._lock:
             self._is_closed = True
-
-
-def _found(maps: dict[str, MemoryMap], name: str) -> MemoryMap:
-    if name not in maps:
-        raise NotFoundError("no_map", f"there is no map {name!r}; `cairn map ls` lists them")
-    return maps[name]

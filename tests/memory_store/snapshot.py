@@ -145,6 +145,7 @@ class MemorySnapshot:
             cells=len(cells),
             size_bytes=sum(cell.size_bytes for cell in cells),
             history_bytes=sum(cell.history_bytes for cell in cells),
+            evidence_bytes=self._state.evidence_bytes(),
             commits=sum(not kept.is_damaged for kept in self._state.commits.values()),
             branches=len(self._state.branches),
             corner_cells=((min(axes[0]), min(axes[1]), min(axes[2])), (max(axes[0]), max(axes[1]), max(axes[2])))

@@ -25,9 +25,10 @@ from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import CairnError, NotFoundError, UnreachableError
 from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
+from cairn_server.map_refusals import GoneMap, check_same_map
 from cairn_server.store.admission import OWN_WORD, Grounds
 from cairn_server.store.replica_notes import FoldHint, ReplicaNotes
-from cairn_server.store.store import Store, check_same_map
+from cairn_server.store.store import Store
 from cairn_server.store.store_age import CLOCKS, AgeMark, Clocks, StoreAge
 from cairn_server.store.store_rows import Branch, Fold, MapRow, NewCommit, StoredCommit
 
@@ -66,7 +67,8 @@ class MemoryStore:
         with self._maps.locked() as maps:
             known = maps.get(name)
             if known is None:
-                maps[name] = new_memory_map(len(maps) + 1, name, layer, sensor_model)
+                self._maps.made += 1
+                maps[name] = new_memory_map(self._maps.made, name, layer, sensor_model)
             else:
                 check_same_map(name, (known.row.layer, known.row.sensor_model), (layer, sensor_model))
             return maps[name].row, known is None
@@ -74,6 +76,19 @@ class MemoryStore:
     def map(self, name: str) -> MapRow:
         """The map of a name."""
         return self._maps.row(name)
+
+    def delete_map(self, row: MapRow, *, by: str) -> GoneMap:
+        """Take a map out of the store for good, and end its tokens."""
+        with self._maps.locked() as maps, self._maps.changing(row):
+            gone = GoneMap(number=row.number, name=row.name, deleted_s=time.time(), by=by)
+            self._maps.gone.append(gone)
+            del maps[row.name]
+            self.tokens.end_with(gone)
+            return gone
+
+    def clear_deleted(self, *, size_bytes_max: int) -> bool:
+        """Nothing: nothing is left of a deleted map."""
+        return False
 
     def maps(self) -> list[MapRow]:
         """All maps, by name."""
@@ -199,7 +214,7 @@ class MemoryStore:
 
     def seen(self, row: MapRow, name: str, cursor: Cursor | None) -> None:
         """Note that a branch was heard of, and where it stands."""
-        with suppress(UnreachableError), self._maps.changing(row) as changed:  # it is only a note
+        with suppress(UnreachableError, NotFoundError), self._maps.changing(row) as changed:  # it is only a note
             known = changed.branches.get(name)
             if known is not None:
                 changed.branches[name] = replace(known, cursor=cursor or known.cursor, last_seen_s=time.time())

@@ -10,6 +10,7 @@ from tests.memory_store.maps import MemoryMaps
 
 from cairn_map.errors import ConflictError, NotFoundError, UnreachableError
 from cairn_map.wire.access_messages import AuditEntry, AuditText, audit_chain
+from cairn_server.map_refusals import GoneMap, map_gone
 from cairn_server.store.store_age import StoreAge
 from cairn_server.store.store_rows import (
     ALL_LINES,
@@ -33,10 +34,15 @@ class MemoryTokens:
         self._tokens: dict[str, tuple[Token, bytes]] = {}
         self._names: dict[bytes, str] = {}
         """By the hash of the secret."""
+        self._gone: dict[bytes, GoneMap] = {}
+        """By the hash of the secret of a token that ended with its map."""
 
     def add(self, token: Token, secret_hash: bytes) -> None:
         """Keep a new token."""
         with self._maps.locked():
+            for gone in self._maps.gone:
+                if gone.number == token.map_number:
+                    raise map_gone(gone)
             if token.name in self._tokens:
                 raise ConflictError("token_exists", f"a token {token.name!r} exists; rotate it, or take another name")
             self._put(replace(token, created_age_s=self._age.now_s()), secret_hash)
@@ -70,6 +76,19 @@ class MemoryTokens:
         with self._maps.locked():
             name = self._names.get(secret_hash)
             return None if name is None else self._tokens[name][0]
+
+    def gone(self, secret_hash: bytes) -> GoneMap | None:
+        """The deleted map with which the token of a secret ended."""
+        with self._maps.locked():
+            return self._gone.get(secret_hash)
+
+    def end_with(self, gone: GoneMap) -> None:
+        """End every token of a map that is deleted."""
+        with self._maps.locked():
+            for token, secret_hash in list(self._tokens.values()):
+                if token.map_number == gone.number:
+                    self._removed(token.name)
+                    self._gone[secret_hash] = gone
 
     def used(self, name: str) -> None:
         """Note that a token was shown just now."""

@@ -920,8 +920,8 @@ SWITCHES = (
         11,
         "evidence that a waiting retract names is kept",
         RETENTION,
-        "gone = [(number, *seqs) for number, *seqs, commit in found if commit not in pinned][:limit]",
-        "gone = [(number, *seqs) for number, *seqs, commit in found][:limit]",
+        "gone = [row_found for row_found in found if row_found[3] not in pinned][:limit]",
+        "gone = found[:limit]",
         "cairn_server/store/test_retention.py::test_evidence_that_a_waiting_commit_takes_out_is_kept",
     ),
     Switch(
@@ -1031,9 +1031,9 @@ SWITCHES = (
     Switch(
         16,
         "evidence that the upstream lacks is not forgotten",
-        "server/cairn_server/folding/fold_thread.py",
-        "before_s = min(before_s, self._may_forget_s(row.name))",
-        "pass",
+        "server/cairn_server/upkeep.py",
+        "may_s = min(before_s, self._may_forget_s(row.name))",
+        "may_s = before_s",
         "cairn_client/relay/test_relay.py::test_a_field_server_forgets_nothing_that_its_upstream_has_not_got",
     ),
     Switch(

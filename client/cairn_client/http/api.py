@@ -59,7 +59,9 @@ from cairn_map.wire.messages import (
     CellIndex,
     CreateMap,
     LogEntry,
+    MapDeleted,
     MapInfo,
+    MapSizes,
     MissingRequest,
     PushReceipt,
     Register,
@@ -229,6 +231,14 @@ class MapApi:
     def create_map(self, name: str, request: CreateMap) -> MapInfo:
         """Create a map, or find the equal one."""
         return message_from_json(MapInfo, self._ask("PUT", f"/maps/{name}", content=request.model_dump_json().encode()))
+
+    def map_sizes(self, name: str) -> MapSizes:
+        """Bytes of a map on its server, by what they are for."""
+        return message_from_json(MapSizes, self._ask("GET", f"/maps/{name}/sizes"))
+
+    def delete_map(self, name: str) -> MapDeleted:
+        """Delete a map for good."""
+        return message_from_json(MapDeleted, self._ask("DELETE", f"/maps/{name}", params={"confirm": name}))
 
     def maps(self) -> list[MapInfo]:
         """All maps."""

@@ -3,6 +3,7 @@
     no token of this server's      register by the enrolment token: it is sent once, to the server that the URL names
     name bound to another key      register by the token and a proof of the robot's keys; else an operator must say so
     token refused                  register by a proof of the key alone, which an operator lets in
+    map deleted                    the same, on a map that was made under its name since
 
 A server that refuses a token may be a stranger in the right one's place, so no secret answers it: neither the enrolment
 token nor anything that could be used elsewhere. A proof names the server that it is for, as the robot's URL names it.
@@ -16,7 +17,7 @@ from cairn_client.http.api import MapApi
 from cairn_client.replica.replica import Replica
 from cairn_client.replica.replica_state import ReplicaState
 from cairn_map.commits.key_proof import KeyProof, proof_bytes
-from cairn_map.errors import BadInputError, CairnError, DeniedError, UnreachableError
+from cairn_map.errors import BadInputError, CairnError, DeniedError, NotFoundError, UnreachableError
 from cairn_map.wire.messages import Mode, Register, Registered
 from cairn_map.wire.origins import origin_of
 
@@ -70,6 +71,7 @@ class Membership:
 
         Raises:
             DeniedError: kind `not_admitted`: an operator must let the robot in; or `bad_token`, and others.
+            NotFoundError: kind `gone`: the map was deleted; nothing here changes by it.
         """
         if self._own_token is None and not self._is_known_by_token:
             self._register()
@@ -79,6 +81,11 @@ class Membership:
             if exc.kind != "bad_token" or self._own_token is None:
                 raise
             self._return(exc)
+            return action(*args, **options)
+        except NotFoundError as exc:
+            if exc.kind != "gone" or self._own_token is None:
+                raise
+            self._join_namesake(exc)
             return action(*args, **options)
 
     def leave(self) -> None:
@@ -124,6 +131,32 @@ class Membership:
         except BaseException:
             self._api.use_token(token)
             raise
+
+    def _join_namesake(self, refusal: NotFoundError) -> None:
+        """Register on a map of the name of a deleted one, if an operator lets this robot in there.
+
+        Not openly, even where that is allowed: evidence of a map that was deleted comes to another one by a person's
+        word alone.
+
+        Raises:
+            NotFoundError: the refusal: there is no such map, or the robot is not let in.
+        """
+        token, self._api.token = self._api.token, None
+        try:
+            # A server that wants no tokens would take any robot.
+            if self._replica.state.may_register_openly and not self._is_let_in():
+                raise DeniedError(refusal.kind, refusal.message)
+            self._keep(self._proven_registration(refusal=DeniedError(refusal.kind, refusal.message)))
+        except BaseException as exc:
+            self._api.use_token(token)
+            if isinstance(exc, DeniedError):
+                raise refusal from exc
+            raise
+
+    def _is_let_in(self) -> bool:
+        """True if an operator's word for this robot's key waits at a server that wants no tokens."""
+        own = str(self._replica.author)
+        return any(key.author == own and key.may_return for key in self._api.keys(self._map_name).admitted)
 
     def _proven_registration(self, *, refusal: DeniedError) -> Registered:
         """Registration with a proof of the robot's keys.

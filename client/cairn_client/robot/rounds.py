@@ -40,6 +40,8 @@ OnPush = Callable[[CommitId], None]
 FIRST_LOOK_S, LONGEST_LOOK_S = 0.05, 1.0
 """Pauses between rounds that look whether the server has folded; each is twice the one before."""
 RETRY_S = 30.0
+GONE_S = 3600.0
+"""Time between two rounds once the map was deleted: only a person can bring it back, or let the robot in on another."""
 ROUND_END_S = 2.0
 """Seconds that a round may go on by itself when the thread is to stop, before it is cut."""
 
@@ -93,7 +95,7 @@ class SyncThread:
                 log.info("%s (%s); trying again in %.1f s", what, exc.message, wait_s)
                 self._wait(exc, wait_s)
             except CairnError as exc:
-                wait_s = backoff.next_s(None)
+                wait_s = GONE_S if exc.kind == "gone" else backoff.next_s(None)
                 log.error("sync failed: %s: %s; trying again in %.1f s", exc.kind, exc.message, wait_s)
                 self._wait(exc, wait_s)
             except Exception as exc:  # a fault of ours; uncaught, the robot would never sync again, and say nothing

@@ -113,6 +113,8 @@ def error_of(status: int, retry_after: str, body: bytes) -> CairnError:
         410: ConflictError,
     }
     family = families.get(status, BadInputError if status < 500 else DamagedDataError)
+    if (status, problem.kind) == (410, "gone"):  # the map; another log answers for the same one
+        family = NotFoundError
     return family(problem.kind, detail)
 
 

@@ -136,6 +136,28 @@ class MapInfo(_Model):
         return MapLayer(geometry=self.geometry, epoch_s=self.epoch_s)
 
 
+class MapSizes(_Model):
+    """Answer to `GET /maps/{map}/sizes`: what a map takes on its server, by what it is for."""
+
+    present_bytes: Count
+    """Bytes of the cells, of the newest row of each."""
+    history_bytes: Count
+    """Bytes of the cells' older rows."""
+    evidence_bytes: Count
+    """Bytes of the commits whose evidence is kept, to be retracted and handed over."""
+    log_bytes: Count
+    """About the bytes of what is kept of each commit for ever."""
+    log_entries: Count
+
+
+class MapDeleted(_Model):
+    """Answer to `DELETE /maps/{map}`."""
+
+    name: NameText
+    deleted_s: Annotated[float, Field(ge=0, allow_inf_nan=False)]
+    """Time of the deletion, UTC seconds since 1970."""
+
+
 class Register(_Model):
     """Body of `POST /maps/{map}/branches`."""
 

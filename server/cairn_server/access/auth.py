@@ -20,6 +20,7 @@ from enum import StrEnum
 
 from cairn_map.commits.ids import SERVERS_OWN, RobotName
 from cairn_map.errors import BadInputError, DeniedError
+from cairn_server.map_refusals import map_gone
 from cairn_server.settings import Settings
 from cairn_server.store.store import Store
 from cairn_server.store.store_rows import MapRow, Token
@@ -112,6 +113,7 @@ class TokenHolders:
 
         Raises:
             DeniedError: kind `no_token`, `bad_token`, also on a map that the token is not for, or `unconfirmed_token`.
+            NotFoundError: kind `gone`: the token ended with its map.
         """
         return self.of_hash(None if token is None else token_hash(token), row)
 
@@ -125,6 +127,8 @@ class TokenHolders:
                 "this server wants a token: Authorization: Bearer TOKEN (the cairn command: --token, CAIRN_TOKEN)",
             )
         caller = self._holder(secret_hash)
+        if caller is None and (gone := self._store.tokens.gone(secret_hash)) is not None:
+            raise map_gone(gone)
         if caller is None or not (row is None or caller.counts_on(row.number)):
             raise bad_token()
         return caller

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 
-from cairn_map.errors import CairnError
+from cairn_map.errors import CairnError, NotFoundError
 from cairn_server.folding.damaged_cells import DamagedCells
 from cairn_server.folding.fold_memory import FoldMemory
 from cairn_server.folding.fold_process import FoldProcess, LostProcessError
@@ -16,6 +16,7 @@ from cairn_server.folding.group_folding import GROUP_MAX, Folded, LocalFolding
 from cairn_server.folding.readiness import FoldHealth
 from cairn_server.store.store import Store
 from cairn_server.store.store_rows import MapRow
+from cairn_server.upkeep import Upkeep
 
 log = logging.getLogger(__name__)
 
@@ -33,10 +34,8 @@ CLAIM_MAX = 4
 """Maps that are claimed at a time, so that processes that fold together share them by how fast they are."""
 LOOK_S = 0.02
 """Time between two looks at a plan in the background."""
-FORGET_MAX = 64
-"""Most commits whose evidence is dropped in one transaction."""
-FORGET_EVERY_S = 60.0
-"""Time between two looks for evidence that need not be kept any longer, and between two looks at the clocks."""
+CLOCKS_EVERY_S = 60.0
+"""Time between two looks at the clocks."""
 RETRY_S = 5.0
 """Longest wait before a failed fold (a full disk) is tried again; waits double from `FIRST_RETRY_S` on."""
 FIRST_RETRY_S = 0.2
@@ -73,9 +72,7 @@ class FoldThread:
         self._health = health
         self._damaged = damaged
         self._on_fold = on_fold
-        self._may_forget_s = may_forget_s
-        self._keep_evidence_s = keep_evidence_s
-        self._forget_next_s = 0.0
+        self.upkeep = Upkeep(store, keep_evidence_s=keep_evidence_s, may_forget_s=may_forget_s)
         self._clocks_next_s = 0.0
         self._wake = threading.Event()
         self._closing = threading.Event()
@@ -112,7 +109,7 @@ class FoldThread:
         retry_s = FIRST_RETRY_S
         while not self._closing.is_set():
             # Commits that came by another server of this store wake nothing here.
-            self._wake.wait(FORGET_EVERY_S if self._store.leases is None else POLL_S)
+            self._wake.wait(min(CLOCKS_EVERY_S if self._store.leases is None else POLL_S, self.upkeep.wait_s()))
             self._wake.clear()
             # A failure is retried without a new commit, after a growing pause.
             if self._fold_all():
@@ -140,6 +137,7 @@ class FoldThread:
             is_news = busy or is_woken or bool(rests)
             busy = False
             self._watch_clocks(time.monotonic())
+            self.upkeep.work()  # here, too: while robots push all the time, this loop has no end
             try:
                 maps = self._maps_at_work(maps if planning else [])
             except Exception:
@@ -155,6 +153,9 @@ class FoldThread:
                     folded = self._fold_group(row, is_news=is_news)
                     busy |= folded.commits > 0
                     planning |= folded.is_planning
+                except NotFoundError as exc:
+                    log.info("map %s is not folded any more: %s", row.name, exc.message)
+                    continue
                 except Exception as exc:
                     # Whatever it is, the other maps go on, and this thread must live: there is no other one.
                     # A `CairnError` says all in its message.
@@ -166,7 +167,7 @@ class FoldThread:
                     took_s = time.monotonic() - start_s
                     is_pushed = self._wake.is_set() or self._is_pushed_elsewhere(row, folded, took_s)
                     rests.begin(row, rest_s(took_s, is_pushed=is_pushed))
-        return not (failed or self._forget_old())
+        return not failed
 
     def _is_pushed_elsewhere(self, row: MapRow, folded: Folded, took_s: float) -> bool:
         """True if other servers of the store take commits of a map: they do not wake this thread, but its folds tell.
@@ -186,10 +187,10 @@ class FoldThread:
         return waiting + [row for row in planned if row.number not in known]
 
     def _watch_clocks(self, now_s: float) -> None:
-        """Keep the store's age, and report a jump of the wall clock, at most once in `FORGET_EVERY_S`."""
+        """Keep the store's age, and report a jump of the wall clock, at most once in `CLOCKS_EVERY_S`."""
         if now_s < self._clocks_next_s:
             return
-        self._clocks_next_s = now_s + FORGET_EVERY_S
+        self._clocks_next_s = now_s + CLOCKS_EVERY_S
         jump_s = self._store.age.jump_s()
         if jump_s:
             self._health.clock_jumped(jump_s)
@@ -200,29 +201,6 @@ class FoldThread:
                 "it, but tokens with a date count by it: set the clock (NTP, chrony)",
             )
         self._store.keep_age()
-
-    def _forget_old(self) -> bool:
-        """Drop evidence that need not be kept any longer, at most once in `FORGET_EVERY_S`; True if that failed."""
-        if time.monotonic() < self._forget_next_s or self._closing.is_set():
-            return False
-        try:
-            before_s = self._store.age.now_s() - self._keep_evidence_s
-            maps = self._store.maps_with_evidence(before_s=before_s)
-            counts = [self._forget_group(row, before_s) for row in maps]
-        except Exception:
-            # Whatever it is: dropping is not urgent, and this thread must live.
-            log.exception("old evidence cannot be dropped")
-            return True
-        if max(counts, default=0) < FORGET_MAX:
-            self._forget_next_s = time.monotonic() + min(FORGET_EVERY_S, self._keep_evidence_s)
-        else:
-            self._wake.set()  # there is more; folding goes first
-        return False
-
-    def _forget_group(self, row: MapRow, before_s: float) -> int:
-        # No evidence is dropped that the upstream server lacks.
-        before_s = min(before_s, self._may_forget_s(row.name))
-        return self._store.forget_evidence(row, before_s=before_s, limit=FORGET_MAX)
 
     def _fold_group(self, row: MapRow, *, is_news: bool) -> Folded:
         start_s = time.monotonic()

@@ -41,6 +41,7 @@ class _LiveMap:
         self.changes = LiveChanges(store, row)
         self.robots = LiveRobots(lambda: _signs(store, row))
         self.listeners: set[Listener] = set()
+        self.is_gone = False
 
 
 class Hub:
@@ -72,6 +73,14 @@ class Hub:
         except CairnError as exc:
             log.warning("map %s: cannot tell listeners what was folded: %s", row.name, exc.message)
         self._wake(live)
+
+    def map_gone(self, row: MapRow) -> None:
+        """Send the listeners of a map away, which was deleted: when they come again, they are refused."""
+        with self._lock:
+            live = self._maps.pop(row.number, None)
+        if live is not None:
+            live.is_gone = True
+            self._wake(live)
 
     def listened_maps(self) -> list[MapRow]:
         """Maps that have listeners."""
@@ -212,8 +221,8 @@ class Listener:
 
     @property
     def is_over(self) -> bool:
-        """True if the server is shutting down, or the map's log lost entries: then a listener begins again."""
-        return self._hub.is_closed or self.live.changes.losses != self._losses
+        """True if the server stops, the map is gone, or its log lost entries: then a listener begins again."""
+        return self._hub.is_closed or self.live.is_gone or self.live.changes.losses != self._losses
 
     @property
     def is_behind(self) -> bool:

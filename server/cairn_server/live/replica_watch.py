@@ -116,7 +116,7 @@ class ReplicaWatch:
         listened = self._hub.listened_maps()
         self._look_at_heads(listened)
         self._seen = {row.number: self._seen[row.number] for row in listened if row.number in self._seen}
-        for row in listened:
+        for row in self._hub.listened_maps():  # without those that are gone
             self._hub.present_robots(row)
 
     def look_at_hinted(self) -> None:
@@ -131,7 +131,12 @@ class ReplicaWatch:
     def _look_at_heads(self, maps: list[MapRow]) -> None:
         if not maps:
             return
-        for row, head in self._store.heads([row.number for row in maps]):
+        heads = self._store.heads([row.number for row in maps])
+        there = {row.number for row, _ in heads}
+        for row in maps:
+            if row.number not in there:  # another server deleted it
+                self._hub.map_gone(row)
+        for row, head in heads:
             if self._seen.get(row.number) != head:
                 self._seen[row.number] = head
                 self._hub.folded(row)

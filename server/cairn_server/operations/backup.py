@@ -1,4 +1,4 @@
-"""Backups of a server's store: the commands `cairn serve backup` and `cairn serve restore`."""
+"""Files of a server's store as a whole: the commands `cairn serve backup`, `restore` and `compact`."""
 
 import argparse
 import logging
@@ -8,13 +8,14 @@ from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
-from cairn_map.errors import EXIT_CODES, BadInputError, DamagedDataError
+from cairn_map.errors import EXIT_CODES, BadInputError, ConflictError, DamagedDataError
 from cairn_map.progress import PercentLine
 from cairn_server.http.middleware.log_format import LogForm, add_log_format, fields, start_logging
 from cairn_server.operations.check import check_all
 from cairn_server.settings import Settings
 from cairn_server.store.sqlite.archive import SqliteArchive
 from cairn_server.store.sqlite.backup import Restored, back_up, restore, send_backup
+from cairn_server.store.sqlite.files.compaction import compact
 
 log = logging.getLogger(__name__)
 
@@ -103,7 +104,7 @@ def restore_command(argv: list[str]) -> int:
     args = parser.parse_args(argv)
     progress = PercentLine("restore")
     summary: list[str] = []
-    restored = restore(args.file, args.data, progress.at, lambda path: summary.append(_verified(path)), old=args.old)
+    restored = restore(args.file, args.data, progress.at, lambda path: summary.append(verified(path)), old=args.old)
     progress.finish()
     sys.stdout.write(f"{args.data}: restored and checked: {summary[0]}\n")
     for line in _told(restored, args.old):
@@ -130,7 +131,7 @@ def _told(restored: Restored, old: Path | None) -> Iterator[str]:
     yield f"not in the backup: commits, audit lines and tokens that came {when}; --old DIR would count them"
 
 
-def _verified(path: Path) -> str:
+def verified(path: Path) -> str:
     """Summary of a copy of a store.
 
     Raises:
@@ -147,3 +148,36 @@ def _verified(path: Path) -> str:
     if outcome.findings:
         raise DamagedDataError("damaged_store", f"the backup is damaged, take another one: {outcome.findings[0][1]}")
     return outcome.summary
+
+
+COMPACT = """Write a stopped server's store again, as small as it can be.
+
+    $ cairn serve compact --data ./cairn-data
+    cairn-data: 812.4 MB before, 41.3 MB now
+
+A running server gives room back by itself: what a deleted map or old evidence leaves is used again for what comes, and
+where more than an eighth of the file is unused, it shrinks by a megabyte at a time. That holds for stores made by this
+version; an older one does so once it was compacted. Compacting leaves no unused room at all. It needs room on the disk
+for the smaller file next to the old one, and the server must be stopped; a kill leaves the old file as it was.
+
+A store in PostgreSQL is looked after by the database: autovacuum makes room for what comes, and VACUUM FULL, which
+locks the tables, gives it back to the disk.
+"""
+
+
+def compact_command(argv: list[str]) -> int:
+    """Compact a store."""
+    parser = argparse.ArgumentParser(
+        "cairn serve compact", description=COMPACT, epilog=EXIT_CODES, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("--data", type=Path, default=Settings().folder, metavar="DIR", help="folder of the store")
+    args = parser.parse_args(argv)
+    try:
+        found = compact(args.data)
+    except ConflictError as exc:
+        raise ConflictError(
+            exc.kind, f"a server works on {args.data}, and gives unused room back by itself; stop it to compact"
+        ) from exc
+    before, after = (f"{size / 1e6:.1f} MB" for size in found)
+    sys.stdout.write(f"{args.data}: {before} before, {after} now\n")
+    return 0

@@ -33,6 +33,9 @@ More commands look after the store (docs/administrator.md, docs/scale.md); each 
     cairn serve backup --data DIR FILE      copy the store into one file, while the server runs
     cairn serve restore FILE --data DIR     make a folder out of such a file
     cairn serve check --data DIR            read everything and report what is damaged; --repair heals it
+    cairn serve compact --data DIR          write a stopped server's store again, as small as it can be
+    cairn serve archive MAP FILE --data DIR copy one map into a file, while the server runs
+    cairn serve unarchive FILE --data DIR   bring it back into a stopped server's store
     cairn serve adopt --store --objects     make a restored database the owner of its bucket
 """
 
@@ -64,9 +67,10 @@ from cairn_server.http.middleware.secure_start import secured
 from cairn_server.http.middleware.work_turns import Lanes
 from cairn_server.http.routes.long_bodies import LongBodies, fork_long_bodies
 from cairn_server.operations import check as check_command
-from cairn_server.operations.backup import back_up_command, restore_command
+from cairn_server.operations.backup import back_up_command, compact_command, restore_command
 from cairn_server.operations.bucket_owner import adopt_command
 from cairn_server.operations.life import Life
+from cairn_server.operations.map_archive import archive_command, unarchive_command
 from cairn_server.operations.reload import Reload
 from cairn_server.operations.serve_options import serve_parser, settings_of
 from cairn_server.operations.store_opening import opened, settling, store_of
@@ -100,6 +104,9 @@ COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "restore": restore_command,
     "check": check_command.main,
     "adopt": adopt_command,
+    "archive": archive_command,
+    "compact": compact_command,
+    "unarchive": unarchive_command,
 }
 
 

@@ -102,10 +102,13 @@ class OwnMaps:
 
         Raises:
             ConflictError: kind `map_exists`; or `too_many_maps`: the upstream could name any number.
+            NotFoundError: kind `gone`: it was deleted here, and no other server's word brings it back.
         """
         try:
             self._service.store.map(upstream.name)
-        except NotFoundError:
+        except NotFoundError as exc:
+            if exc.kind == "gone":
+                raise
             self._check_place()
         request = CreateMap(geometry=upstream.geometry, sensor_model=upstream.sensor_model, epoch_s=upstream.epoch_s)
         _, is_new = self._service.maps.create(upstream.name, request)

@@ -15,13 +15,12 @@ from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.ids import Author, CommitId, Incarnation
 from cairn_map.commits.version_vector import VersionVector
 from cairn_map.epochs.epoch import Epoch
-from cairn_map.epochs.layer import MapLayer
-from cairn_map.errors import ConflictError
 from cairn_map.evidence.fingerprint import Fingerprint
 from cairn_map.evidence.grid import CellKey, Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.wire.access_messages import AuditEntry
 from cairn_map.wire.messages import LogEntry
+from cairn_server.map_refusals import GoneMap
 from cairn_server.store.admission import OWN_WORD, Grounds, RobotKey
 from cairn_server.store.replica_notes import ReplicaNotes
 from cairn_server.store.store_age import StoreAge
@@ -254,6 +253,13 @@ class StoreHealth(Protocol):
         """
         ...
 
+    def shrink(self) -> bool:
+        """Give a bounded part of the file's unused room back to the disk; True while that is under way.
+
+        It begins once much of the file is unused. A database does so itself, if at all.
+        """
+        ...
+
     def heal(self, row: MapRow, cell: CellRow) -> bool:
         """Replace a damaged cell by a sound one; False if the cell changed meanwhile. Durable on return."""
         ...
@@ -310,6 +316,10 @@ class Tokens(Protocol):
         """The token of a secret, ended or not."""
         ...
 
+    def gone(self, secret_hash: bytes) -> GoneMap | None:
+        """The deleted map with which the token of a secret ended; None: there was no such token."""
+        ...
+
     def used(self, name: str) -> None:
         """Note that a token was shown just now; written some seconds later."""
         ...
@@ -343,33 +353,6 @@ class AuditLog(Protocol):
     ) -> list[AuditEntry]:
         """Lines of a choice numbered above `after`, oldest first; with `before` those below it, newest first."""
         ...
-
-
-def check_same_map(name: str, known: tuple[MapLayer, SensorModel], asked: tuple[MapLayer, SensorModel]) -> None:
-    """Refuse to make a map of a name that another one has.
-
-    Raises:
-        ConflictError: kind `map_exists`.
-    """
-    way_out = "Use it as it is, or take another name"
-    (layer, sensor_model), (other_layer, other_model) = known, asked
-    if layer.geometry != other_layer.geometry:
-        raise ConflictError(
-            "map_exists", f"map {name} exists with {layer.geometry}; asked for were {other_layer.geometry}. {way_out}"
-        )
-    if layer.epoch_s != other_layer.epoch_s:
-        raise ConflictError(
-            "map_exists",
-            f"map {name} exists {_epochs_text(layer)}; asked for was one {_epochs_text(other_layer)}. {way_out}",
-        )
-    if sensor_model != other_model:
-        raise ConflictError(
-            "map_exists", f"map {name} exists with {sensor_model!r}; asked for was {other_model!r}. {way_out}"
-        )
-
-
-def _epochs_text(layer: MapLayer) -> str:
-    return "without epochs" if layer.epoch_s is None else f"with epochs of {layer.epoch_s} s"
 
 
 class Store(Protocol):
@@ -450,7 +433,24 @@ class Store(Protocol):
         """The map of a name.
 
         Raises:
-            NotFoundError: there is none.
+            NotFoundError: kind `no_map`: there is none, or `gone`: the last one of that name was deleted.
+        """
+        ...
+
+    def delete_map(self, row: MapRow, *, by: str) -> GoneMap:
+        """Take a map out of the store for good, and end its tokens; durable on return.
+
+        Its rows go later (`clear_deleted`). Whatever is asked of it from here on is refused as `map_gone` says.
+
+        Raises:
+            NotFoundError: kind `gone`.
+        """
+        ...
+
+    def clear_deleted(self, *, size_bytes_max: int) -> bool:
+        """Remove about so many bytes of what deleted maps left; False once nothing is left of them.
+
+        A kill in between leaves the rest to the next call.
         """
         ...
 

@@ -225,6 +225,10 @@ class HeardRobot:
     """Time of the sign, UTC seconds since 1970."""
 
 
+LOG_ENTRY_BYTES = 500
+"""About the bytes of a log entry and of what is kept of its commit for ever, with their indexes."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Totals:
     """Sizes of a map."""
@@ -236,6 +240,8 @@ class Totals:
     corner_cells: tuple[tuple[int, int, int], tuple[int, int, int]] | None = None
     history_bytes: int = 0
     """Bytes, of `size_bytes`, of rows that are older than the newest one of their cell."""
+    evidence_bytes: int = 0
+    """Bytes of the commits whose evidence is kept, as they were pushed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -356,6 +362,12 @@ class StoreFigures:
     """Bytes of the cells of all maps."""
     history_bytes: int
     """Bytes, of these, of rows that are older than the newest one of their cell."""
+    evidence_bytes: int
+    """Bytes of the commits of all maps whose evidence is kept."""
+    log_entries: int
+    """Log entries of all maps."""
+    unused_bytes: int
+    """Bytes of the store's file that nothing uses."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

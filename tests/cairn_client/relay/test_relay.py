@@ -151,8 +151,8 @@ def test_a_field_server_forgets_nothing_that_its_upstream_has_not_got(base: Serv
         [commit] = field.ids()
 
         def is_gone() -> bool:
-            field.service._fold_thread._forget_next_s = 0.0
-            assert not field.service._fold_thread._forget_old()
+            assert field.service._fold_thread is not None
+            field.service._fold_thread.upkeep._forget()
             found = field.service.store.commit(field.row, commit)
             return found is not None and found.gone
 

@@ -13,6 +13,7 @@ from tests.fixtures.server.answers import kind_of
 from tests.fixtures.server.branch_contract import BranchContract
 from tests.fixtures.server.commit_contract import CommitContract
 from tests.fixtures.server.crowd_contract import CrowdContract
+from tests.fixtures.server.deletion_contract import DeletionContract
 from tests.fixtures.server.epoch_contract import EpochContract
 from tests.fixtures.server.evidence_contract import EvidenceContract
 from tests.fixtures.server.fetching import fetch
@@ -32,6 +33,7 @@ from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.wire.access_messages import CreateToken
 from cairn_server.store.store import Store
 from cairn_server.store.store_age import Clocks
+from cairn_server.store.store_rows import MapRow
 
 
 @pytest.fixture(scope="module")
@@ -52,8 +54,15 @@ class TestMemoryStore(
     BranchContract,
     AccessContract,
     AdmissionContract,
+    DeletionContract,
 ):
     """All of the contract."""
+
+    clears = False
+
+    def rows_of(self, store: Store, row: MapRow) -> dict[str, int]:
+        """Nothing: there are no rows."""
+        return {}
 
 
 class Passing:

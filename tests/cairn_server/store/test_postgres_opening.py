@@ -99,6 +99,8 @@ def test_a_store_of_the_first_step_takes_those_that_it_lacks(
 
 WITHOUT_EPOCHS = """
 ALTER TABLE audit DROP COLUMN client;
+DROP TABLE gone_map, gone_token;
+ALTER TABLE author DROP COLUMN kept_bytes;
 ALTER TABLE age DROP COLUMN clock;
 ALTER TABLE map DROP COLUMN epoch_s;
 ALTER TABLE commits DROP COLUMN epoch;
@@ -109,7 +111,7 @@ ALTER TABLE tile DROP COLUMN history_bytes;
 ALTER TABLE server DROP COLUMN step;
 UPDATE cairn_schema SET version = 5;
 """
-"""SQL that takes the step of epochs back."""
+"""SQL that takes the step of epochs and those after it back."""
 
 
 def test_a_store_of_before_epochs_opens_as_it_was_and_takes_maps_with_them(postgres_database: Database) -> None:

@@ -170,7 +170,7 @@ def test_idle_maps_cost_probes_and_metrics_no_statement(
     service.close()
 
 
-OF_THE_STORE = {"map", "token", "dead_object_since"}
+OF_THE_STORE = {"map", "token", "gone_map_name", "gone_token", "dead_object_since"}
 """Tables and an index whose keys find a map, or what is due in any: those of a directory, were maps spread."""
 KEYS_OF_TABLES = """
     SELECT table_.relname, index_.relname,

@@ -10,6 +10,7 @@ from tests.fixtures.map.made import SMALL, random_evidence
 from tests.fixtures.server.commit_contract import folded_map
 from tests.fixtures.server.crowd_contract import all_at_once
 from tests.fixtures.server.deadline import until
+from tests.fixtures.server.deletion_contract import cleared
 from tests.fixtures.server.evidence_contract import SOON, cells_of, fold, kept_bytes
 from tests.fixtures.server.object_store import READER, ObjectPlace
 from tests.fixtures.server.postgres import Database, PostgresServer, new_database
@@ -130,6 +131,23 @@ def test_a_segment_goes_with_its_last_piece(store: ColdStore, database: Database
     assert segment not in dead(database)
     assert store.forget_evidence(row, before_s=SOON, limit=3) == 1
     assert dead(database) == {segment}
+
+
+def test_objects_of_a_deleted_map_are_dead_with_its_rows_and_go_in_time(store: ColdStore, database: Database) -> None:
+    row, other = folded_map(store, *COMMITS), folded_map(store, *COMMITS)
+    store.settle(other)
+    kept = named(database)
+    store.settle(row)
+    own = named(database) - kept
+    store.delete_map(row, by="admin")
+    assert store.bucket.objects() == kept | own
+    cleared(store, 1)
+    assert (named(database), dead(database)) == (kept, own)
+    before = contents(store, other)
+    while store.settler.delete_dead(before_s=SOON):
+        pass
+    assert store.bucket.objects() == kept
+    assert contents(store, other) == before
 
 
 def test_evidence_that_was_pushed_again_is_here_again(store: ColdStore, database: Database) -> None:

@@ -18,11 +18,13 @@ from tests.fixtures.server.admission_contract import AdmissionContract
 from tests.fixtures.server.branch_contract import BranchContract, branch, token
 from tests.fixtures.server.commit_contract import CommitContract
 from tests.fixtures.server.crowd_contract import CrowdContract
+from tests.fixtures.server.deletion_contract import DeletionContract
 from tests.fixtures.server.epoch_contract import EpochContract
 from tests.fixtures.server.evidence_contract import EvidenceContract
 from tests.fixtures.server.pushes import MOLE, WREN, pushed
 from tests.fixtures.server.shares_contract import SharesContract, author_of
 from tests.fixtures.server.store_contract import NAMES, StoreContract, new_of
+from tests.fixtures.server.stores import sqlite_of
 
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.ids import OPERATOR, Author, CommitId
@@ -37,6 +39,9 @@ from cairn_server.store.sqlite.schema import ensure_schema
 from cairn_server.store.sqlite.shares import IS_RESERVE
 from cairn_server.store.sqlite.snapshot import CELL_COLUMNS
 from cairn_server.store.sqlite.store import FILE_NAME, SqliteStore
+from cairn_server.store.sqlite.writer import first, rows
+from cairn_server.store.store import Store
+from cairn_server.store.store_rows import MapRow
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +50,10 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SqliteStore]:
     made = SqliteStore(tmp_path_factory.mktemp("contract"))
     yield made
     made.close()
+
+
+def columns_of(connection: apsw.Connection, table: str) -> set[str]:
+    return {name for (name,) in rows(connection, "SELECT name FROM pragma_table_info(?)", (table,))}
 
 
 @pytest.fixture
@@ -65,8 +74,20 @@ class TestSqliteStore(
     BranchContract,
     AccessContract,
     AdmissionContract,
+    DeletionContract,
 ):
     """All of the contract."""
+
+    def rows_of(self, store: Store, row: MapRow) -> dict[str, int]:
+        """Count of the rows that a table has of a map."""
+        with sqlite_of(store)._readers.reading() as reader:
+            tables = [name for (name,) in rows(reader, "SELECT name FROM sqlite_master WHERE type = 'table'")]
+            of_map = [name for name in tables if "map" in columns_of(reader, name) and name != "gone_token"]
+            queries = {name: f"SELECT count(*) FROM {name} WHERE map = ?1" for name in of_map}
+            queries["map"] = "SELECT count(*) FROM map WHERE number = ?1"
+            queries["diff"] = "SELECT count(*) FROM diff WHERE ?1 AND commit_number NOT IN (SELECT number FROM commits)"
+            counts = {name: first(reader, query, (row.number,)) for name, query in queries.items()}
+        return {name: count for name, count in counts.items() if count}
 
 
 STEPS = [

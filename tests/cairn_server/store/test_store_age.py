@@ -59,9 +59,14 @@ def served(folder: Path, clocks: TestClocks, **settings: Any) -> Iterator[Live]:
 def look(live: Live) -> None:
     """The server looks at its clocks, and for what it may forget, as it does each minute."""
     thread = live.service._fold_thread
-    thread._clocks_next_s = thread._forget_next_s = 0.0
+    assert thread is not None
+    due_s = thread.upkeep._next_s
+    thread._clocks_next_s = 0.0
     thread.wake()
-    until(lambda: min(thread._clocks_next_s, thread._forget_next_s) > 0, "it looked")
+    until(lambda: thread._clocks_next_s > 0, "it looks at its clocks")
+    due_s[thread.upkeep._forget] = 0.0
+    thread.wake()
+    until(lambda: due_s[thread.upkeep._forget] > 0, "it looked at them, and for what it may forget")
 
 
 def jumps(live: Live) -> list[str]:

@@ -12,6 +12,7 @@
     $ cairn map branches http://127.0.0.1:8750/maps/lab
     $ cairn map retract http://127.0.0.1:8750/maps/lab --robot mole --pushed-after 14:05 --dry-run
     $ cairn map robots list http://127.0.0.1:8750/maps/lab
+    $ cairn map delete http://127.0.0.1:8750/maps/lab
     $ cairn map query lab/ ray 1,2,0.4 0,1,0
     $ cairn map render lab/ --from 1,2,1.4 --to 4,2,1 -o view.png
 
@@ -38,11 +39,22 @@ from cairn_client.cli.arguments import (
     shown_bytes,
     shown_length,
 )
-from cairn_client.cli.maps import branch_table, changes, create, map_export, map_log, query, render, robots, server_copy
+from cairn_client.cli.maps import (
+    branch_table,
+    changes,
+    create,
+    delete,
+    map_export,
+    map_log,
+    query,
+    render,
+    robots,
+    server_copy,
+)
 from cairn_client.http.api import MapApi
 from cairn_client.sync.responses import one_line
-from cairn_map.errors import BadInputError
-from cairn_map.wire.messages import Retract
+from cairn_map.errors import BadInputError, NotFoundError
+from cairn_map.wire.messages import MapSizes, Retract
 from cairn_map.wire.utc_times import with_utc
 
 DIGEST = re.compile("[0-9a-f]{64}")
@@ -65,6 +77,8 @@ def main(argv: list[str]) -> int:
         render.add_parser,
         _add_retract,
         robots.add_parser,
+        delete.add_parser,
+        delete.add_rename,
     )
     return run_subcommand("cairn map", __doc__, parts, argv)
 
@@ -102,10 +116,11 @@ def _add_info(commands: Subparsers) -> None:
 def _info(args: argparse.Namespace) -> int:
     api, name = api_of(args.map, args.token)
     with api:
-        info, branches = api.map_info(name), api.branches(name)
+        info, branches, sizes = api.map_info(name), api.branches(name), _sizes(api, name)
     if args.json:
-        branch_json = [with_utc(branch).model_dump(mode="json") for branch in branches]
-        say(json.dumps({**info.model_dump(mode="json"), "branch_list": branch_json}))
+        more: dict[str, object] = {"branch_list": [with_utc(branch).model_dump(mode="json") for branch in branches]}
+        more |= {"sizes": sizes.model_dump(mode="json")} if sizes else {}
+        say(json.dumps({**info.model_dump(mode="json"), **more}))
         return 0
     create.say_map(info)
     size = shown_bytes(info.size_bytes)
@@ -113,6 +128,9 @@ def _info(args: argparse.Namespace) -> int:
         present, history = info.size_bytes - info.history_bytes, info.history_bytes
         size += f" ({shown_bytes(present)} of the present, {shown_bytes(history)} of history)"
     say(f"{info.cells} cells, {size}, {info.commits} commits; head {info.cursor}")
+    if sizes is not None:
+        kept, log = shown_bytes(sizes.evidence_bytes), shown_bytes(sizes.log_bytes)
+        say(f"besides the cells {kept} of evidence that is kept, and about {log} of log ({sizes.log_entries} entries)")
     if info.box_m:
         low, high = ("  ".join(f"{value:.2f}" for value in corner) for corner in info.box_m)
         say(f"cells span ({low}) m to ({high}) m")
@@ -122,6 +140,16 @@ def _info(args: argparse.Namespace) -> int:
         seen_s, sensors = time.time() - branch.last_seen_s, one_line(", ".join(branch.sensors))
         say(f"  {branch.branch:<16} {branch.mode:<9} {lag}, seen {seen_s:.0f} s ago, {sensors}")
     return 0
+
+
+def _sizes(api: MapApi, name: str) -> MapSizes | None:
+    """Sizes of a map; None from a server of an earlier version."""
+    try:
+        return api.map_sizes(name)
+    except NotFoundError as exc:
+        if exc.kind != "no_route":
+            raise
+        return None
 
 
 def _add_retract(commands: Subparsers) -> None:

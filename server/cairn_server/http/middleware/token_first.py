@@ -13,7 +13,7 @@ from typing import Any
 
 from starlette.concurrency import run_in_threadpool
 
-from cairn_map.errors import BadInputError, CairnError, DeniedError
+from cairn_map.errors import BadInputError, CairnError, DeniedError, NotFoundError
 from cairn_server.access.auth import Caller, Role
 from cairn_server.access.own_names import OwnNames
 from cairn_server.http.middleware.asgi import App, Receive, Send, send_problem
@@ -44,12 +44,12 @@ class TokenFirst:
         if scope["type"] in ("http", "websocket"):
             try:
                 caller = self._caller(scope)
-            except (DeniedError, BadInputError) as exc:
+            except (DeniedError, BadInputError, NotFoundError) as exc:
                 await self._note(scope, exc)
                 # What needs no body may need no token either: that is the route's to know.
                 if scope["type"] == "http" and scope["method"] not in WITHOUT_BODY:
                     await _drop_small_body(scope, receive)
-                    await send_problem(send, 401 if isinstance(exc, DeniedError) else 400, exc.kind, exc.message)
+                    await send_problem(send, _status_of(exc), exc.kind, exc.message)
                     return
             except CairnError:
                 pass  # a store that cannot be asked is the route's to report
@@ -79,6 +79,13 @@ class TokenFirst:
             return self._service.sync.admissions.returning(
                 path[1], proof, own=self._own_names.origins(scope["scheme"], scope["server"])
             )
+
+
+def _status_of(exc: CairnError) -> int:
+    """Status of a refusal; of a token that ended with its map: 410."""
+    if isinstance(exc, NotFoundError):
+        return 410
+    return 401 if isinstance(exc, DeniedError) else 400
 
 
 async def _drop_small_body(scope: MutableMapping[str, Any], receive: Receive) -> None:

@@ -19,7 +19,7 @@ from fastapi.responses import StreamingResponse
 from fastapi.security import HTTPAuthorizationCredentials
 from starlette.types import Receive, Scope, Send
 
-from cairn_map.errors import BadInputError, CairnError, DeniedError
+from cairn_map.errors import BadInputError, CairnError, DeniedError, NotFoundError
 from cairn_map.wire.live_events import Beat, EventPosition, LiveEvent, position_from_text
 from cairn_server.access.auth import READING, require
 from cairn_server.http.middleware.token_first import offered_token
@@ -99,7 +99,7 @@ class _Stream:
         """True if the token still allows reading, or if that cannot be found out."""
         try:
             require(self._asker.caller(self._row), *READING)
-        except DeniedError:
+        except (DeniedError, NotFoundError):  # the token ended, perhaps with its map
             return False
         except CairnError as exc:  # an unreadable store is no reason to cut a listener off
             log.warning("cannot look a listener's token up: %s", exc.message)

@@ -5,8 +5,9 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Query, Response
 
 from cairn_map.commits.commit import EPOCH_VERSION
+from cairn_map.errors import BadInputError
 from cairn_map.wire.live_events import NAMES_MAX
-from cairn_map.wire.messages import CreateMap, LogEntry, MapInfo, Retract, Retracted
+from cairn_map.wire.messages import CreateMap, LogEntry, MapDeleted, MapInfo, MapSizes, Retract, Retracted
 from cairn_server.access.auth import READING, Caller, Role
 from cairn_server.http.routes.callers import READERS, Format, Map, Operations, Times, admin, allowed, reader_somewhere
 from cairn_server.http.routes.documentation import also, json_body, problems
@@ -51,10 +52,39 @@ def create_map(
     return _known_facts(info, known)
 
 
+@router.delete("/maps/{name}", responses=problems(400, 410))
+def delete_map(
+    service: Operations, row: Map, caller: Annotated[Caller, Depends(allowed())], confirm: str = ""
+) -> MapDeleted:
+    """Delete a map for good, with its tokens; `confirm` is its name once more."""
+    if confirm != row.name:
+        raise BadInputError("not_confirmed", f"?confirm={row.name} deletes map {row.name} for good")
+    service.store.audit_log.add(
+        caller.name, "delete_map", f"map {row.name}: {service.maps.info(row).cursor}", client=caller.address
+    )
+    return service.maps.delete(row, by=caller.name)
+
+
+@router.patch("/maps/{name}", status_code=204, responses=problems(400))
+def change_map(row: Map, caller: Annotated[Caller, Depends(allowed())]) -> None:
+    """Refuse to change a map, and say why."""
+    raise BadInputError(
+        "map_is_fixed",
+        f"map {row.name} keeps its name, grid, channels and epochs: its robots signed their commits for that name, and "
+        "its cells are sums on that grid. Make another map, and let robots push there",
+    )
+
+
 @router.get("/maps/{name}", dependencies=[Depends(allowed(*READING, Role.ENROLLER))])
 def get_map(service: Operations, row: Map, known: Format) -> MapInfo:
     """One map's extent, sizes and head."""
     return _known_facts(service.maps.info(row), known)
+
+
+@router.get("/maps/{name}/sizes", dependencies=READERS)
+def sizes(service: Operations, row: Map) -> MapSizes:
+    """Bytes of a map, by what they are for."""
+    return service.maps.sizes(row)
 
 
 def _known_facts(info: MapInfo, known: int) -> MapInfo:

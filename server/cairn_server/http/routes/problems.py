@@ -32,6 +32,7 @@ STATUS_OF_KIND = {
     "bad_ticket": 401,
     "too_large": 413,
     "other_log": 410,
+    "gone": 410,
     "quota": 429,
     "bad_clock": 425,
     "damaged_store": 500,

@@ -1,9 +1,14 @@
-"""Errors of PostgreSQL as errors of cairn: a full disk, damaged pages, or a database that cannot work now."""
+"""Errors of PostgreSQL as errors of cairn: a full disk, damaged pages, a database that cannot work now; lost maps."""
+
+from typing import Any
 
 import psycopg
 from psycopg import errors
 
-from cairn_map.errors import BadInputError, CairnError, DamagedDataError, UnreachableError
+from cairn_map.errors import BadInputError, CairnError, DamagedDataError, NotFoundError, UnreachableError
+from cairn_server.map_refusals import GoneMap, map_gone, no_map
+
+_Connection = psycopg.Connection[tuple[Any, ...]]
 
 RETRY_S = 2.0
 """A failover takes some seconds."""
@@ -27,12 +32,27 @@ def failure_of(exc: psycopg.Error) -> CairnError:
     return UnreachableError("store_failed", f"the database does not answer: {text}", retry_after_s=RETRY_S)
 
 
-def lost_map(number: int) -> UnreachableError:
-    """Error for a map that a server knows and the database has no more: it was put back to a state before the map.
+def lost_map(connection: _Connection, number: int) -> CairnError:
+    """Error for a map that a server knows and the database has no more: it was deleted.
 
-    The name is looked up again soon (`store.NAMES_S`), and may be another map's now.
+    Or the database was put back to a state before the map. The name is looked up again soon (`store.NAMES_S`), and may
+    be another map's now.
     """
+    gone = _gone(connection, "WHERE map = %s", number)
+    if gone is not None:
+        return map_gone(gone)
     return UnreachableError("store_failed", f"the database has lost map number {number}", retry_after_s=RETRY_S)
+
+
+def missing_map(connection: _Connection, name: str) -> NotFoundError:
+    """Error for a name that no map has: `gone`, if one had it."""
+    gone = _gone(connection, "WHERE name = %s ORDER BY deleted_s DESC LIMIT 1", name)
+    return no_map(name) if gone is None else map_gone(gone)
+
+
+def gone_of_token(connection: _Connection, secret_hash: bytes) -> GoneMap | None:
+    """The deleted map with which the token of a secret ended."""
+    return _gone(connection, "WHERE map = (SELECT map FROM gone_token WHERE hash = %s)", secret_hash)
 
 
 def opening_failure(exc: psycopg.Error, place: str) -> BadInputError:
@@ -56,3 +76,8 @@ def opening_failure(exc: psycopg.Error, place: str) -> BadInputError:
 
 def _cause(exc: psycopg.Error) -> str:
     return exc.diag.message_primary or " ".join(str(exc).split()) or type(exc).__name__
+
+
+def _gone(connection: _Connection, clause: str, value: str | int | bytes) -> GoneMap | None:
+    found = connection.execute(f"SELECT map, name, deleted_s, by FROM gone_map {clause}".encode(), (value,)).fetchone()
+    return None if found is None else GoneMap(number=found[0], name=found[1], deleted_s=found[2], by=found[3])

@@ -114,8 +114,9 @@ class PgHealth:
         """Sizes and counts."""
         with self._connections.lent() as connection:
             size_bytes, used = first(connection, SIZE), first(connection, USED)
-            sums = "SELECT coalesce(sum(cells_bytes), 0)::bigint, coalesce(sum(history_bytes), 0)::bigint FROM head"
-            cells_bytes, history_bytes = first(connection, sums)
+            sums = ", ".join(f"coalesce(sum({each}), 0)::bigint" for each in ("cells_bytes", "history_bytes", "seq"))
+            cells_bytes, history_bytes, entries = first(connection, f"SELECT {sums} FROM head")
+            evidence_bytes = first(connection, "SELECT coalesce(sum(kept_bytes), 0)::bigint FROM author")
         return StoreFigures(
             size_bytes=size_bytes,
             ahead_bytes=0,
@@ -126,6 +127,9 @@ class PgHealth:
             failures=dict(self._connections.failures),
             cells_bytes=cells_bytes,
             history_bytes=history_bytes,
+            evidence_bytes=evidence_bytes,
+            log_entries=entries,
+            unused_bytes=max(0, size_bytes - used),
         )
 
     def check_space(self, free_bytes_min: int) -> None:
@@ -150,6 +154,10 @@ class PgHealth:
         self._is_alarmed = is_alarmed
         if used > FULL_SHARE * room or room - used < free_bytes_min:
             raise UnreachableError("disk_full", f"the database has {text}", retry_after_s=RETRY_FULL_S)
+
+    def shrink(self) -> bool:
+        """Nothing: VACUUM, which the database runs itself, makes room for other rows."""
+        return False
 
     def heal(self, row: MapRow, cell: CellRow) -> bool:
         """Put sound bytes in the place of a damaged cell; False if it changed meanwhile."""

@@ -13,7 +13,7 @@ from psycopg import errors
 from cairn_map.commits.ids import Author
 from cairn_map.errors import ConflictError, UnreachableError
 from cairn_server.store.postgres.connections import Connection, Connections, first
-from cairn_server.store.postgres.retention import check_kept, is_retracted, remember_evidence
+from cairn_server.store.postgres.retention import check_kept, count_kept, is_retracted, remember_evidence
 from cairn_server.store.postgres.robot_keys import admit_commit
 from cairn_server.store.postgres.schema import NOW_S
 from cairn_server.store.postgres.shares import CHARGE, charge_of, check_charge, lock_head, note_number
@@ -33,7 +33,7 @@ KEEP = f"""
 """SQL that keeps a commit without its diff."""
 FAST = f"""
 WITH next AS (
-    UPDATE author SET top = %(n)s
+    UPDATE author SET top = %(n)s, kept_bytes = kept_bytes + %(size_bytes)s
     WHERE map = %(map)s AND robot = %(robot)s AND incarnation = %(incarnation)s AND top = %(n)s - 1 AND NOT closed
         AND EXISTS (
             SELECT FROM robot_key AS k
@@ -83,6 +83,7 @@ def append_slowly(connection: Connection, row: MapRow, commit: NewCommit, *, age
     check_kept(connection, row, commit.retracts)
     admit_commit(connection, row, commit.id.author, commit.grounds)
     note_number(connection, row, commit.id, is_carried=commit.via is not None)
+    count_kept(connection, row, commit.id.author, commit.size_bytes)
     values = _values(row, commit, age_s)
     if commit.tops:
         check_charge(connection, row, commit.id, commit.tops)

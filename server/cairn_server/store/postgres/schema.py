@@ -367,6 +367,23 @@ CREATE INDEX commits_epoch ON commits (map, epoch) WHERE epoch IS NOT NULL;
 ADDRESSES = """
 ALTER TABLE audit ADD COLUMN client text NOT NULL DEFAULT '';       -- address that a request came from
 """
+GONE = """
+CREATE TABLE gone_map (                             -- deleted
+    map bigint PRIMARY KEY,
+    name text COLLATE "C" NOT NULL,
+    deleted_s float8 NOT NULL,
+    by text NOT NULL,                               -- name of the token
+    cleared boolean NOT NULL DEFAULT false          -- no row of it is left
+);
+CREATE INDEX gone_map_name ON gone_map (name);
+CREATE INDEX gone_map_left ON gone_map (map) WHERE NOT cleared;
+CREATE TABLE gone_token (hash bytea PRIMARY KEY, map bigint NOT NULL);  -- that ended with its map
+ALTER TABLE author ADD COLUMN kept_bytes bigint NOT NULL DEFAULT 0;     -- of its commits whose evidence is not gone
+UPDATE author SET kept_bytes = kept.size_bytes FROM (
+    SELECT map, robot, incarnation, sum(size_bytes)::bigint AS size_bytes FROM commits WHERE NOT gone GROUP BY 1, 2, 3
+) AS kept
+WHERE author.map = kept.map AND author.robot = kept.robot AND author.incarnation = kept.incarnation;
+"""
 BOUND_OLDEST = 4
 """Oldest step whose programs read a store of which bytes are in an object store."""
 
@@ -381,7 +398,7 @@ class Step:
 
 
 STEPS = tuple(
-    Step(sql, oldest=1) for sql in (FIRST, REPLICAS, SERVERS, OBJECTS, OWNED_OBJECTS, EPOCHS, CLOCK, ADDRESSES)
+    Step(sql, oldest=1) for sql in (FIRST, REPLICAS, SERVERS, OBJECTS, OWNED_OBJECTS, EPOCHS, CLOCK, ADDRESSES, GONE)
 )
 
 

@@ -168,7 +168,7 @@ def close_robot(connection: Connection, row: MapRow, robot: str) -> ClosedRobot:
 def lock_head(connection: Connection, row: MapRow) -> None:
     """Lock a map's head: folds and all that may not overlap with them come one after the other."""
     if not connection.execute("SELECT 1 FROM head WHERE map = %s FOR NO KEY UPDATE", (row.number,)).rowcount:
-        raise lost_map(row.number)
+        raise lost_map(connection, row.number)
 
 
 class PgShares:

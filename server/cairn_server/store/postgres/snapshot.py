@@ -65,7 +65,7 @@ class PgSnapshot:
         self._vectors = vectors
         head = first(connection, "SELECT log_id, seq, chain FROM head WHERE map = %s", (map_number,))
         if head is None:
-            raise lost_map(map_number)
+            raise lost_map(connection, map_number)
         self._head = Cursor(*head)
         self._held: dict[CellKey, CellRow | None] = {}
 
@@ -336,9 +336,11 @@ class PgSnapshot:
         sums, corners = totals_of(self._connection, self._map)
         query = (
             "SELECT folded + (SELECT count(*) FROM commits WHERE map = %(map)s AND folded_seq IS NULL"
-            " AND damaged IS NULL), (SELECT count(*) FROM branch WHERE map = %(map)s) FROM head WHERE map = %(map)s"
+            " AND damaged IS NULL), (SELECT count(*) FROM branch WHERE map = %(map)s),"
+            " (SELECT coalesce(sum(kept_bytes), 0)::bigint FROM author WHERE map = %(map)s)"
+            " FROM head WHERE map = %(map)s"
         )
-        commits, branches = first(self._connection, query, {"map": self._map})
+        commits, branches, evidence_bytes = first(self._connection, query, {"map": self._map})
         return Totals(
             cells=sums.cells,
             size_bytes=sums.size_bytes,
@@ -346,6 +348,7 @@ class PgSnapshot:
             branches=branches,
             corner_cells=corners,
             history_bytes=sums.history_bytes,
+            evidence_bytes=evidence_bytes,
         )
 
 

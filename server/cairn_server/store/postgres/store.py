@@ -12,27 +12,28 @@ from cairn_map.commits.cursor import Cursor, first_chain
 from cairn_map.commits.ids import Author
 from cairn_map.epochs.epoch import BASE, Epoch
 from cairn_map.epochs.layer import MapLayer
-from cairn_map.errors import ConflictError, NotFoundError, UnreachableError
+from cairn_map.errors import ConflictError, UnreachableError
 from cairn_map.evidence.fingerprint import ZERO
 from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
+from cairn_server.map_refusals import GoneMap, check_same_map
 from cairn_server.store.admission import OWN_WORD, Grounds
 from cairn_server.store.objects.cold_bytes import ColdReads
 from cairn_server.store.postgres.branches import PgBranches
 from cairn_server.store.postgres.connections import NOTING, Connection, Connections, first
+from cairn_server.store.postgres.failures import missing_map
 from cairn_server.store.postgres.folds import PgLeases, write_fold
 from cairn_server.store.postgres.health import PgHealth, PgUses
 from cairn_server.store.postgres.pushes import append_commit, append_slowly, next_number
 from cairn_server.store.postgres.reads import PgReads
 from cairn_server.store.postgres.replica_notes import PgReplicaNotes
-from cairn_server.store.postgres.retention import forget_evidence
+from cairn_server.store.postgres.retention import DYING, clear_part, delete_map, forget_evidence
 from cairn_server.store.postgres.robot_keys import PgAdmittedKeys
 from cairn_server.store.postgres.schema import EPOCHS_OLDEST, NOW_S, prepare
 from cairn_server.store.postgres.shares import PgShares
 from cairn_server.store.postgres.tokens import PgAuditLog, PgTokens
 from cairn_server.store.postgres.writing_threads import WritingThreads
 from cairn_server.store.replica_notes import SERVER_S
-from cairn_server.store.store import check_same_map
 from cairn_server.store.store_age import CLOCKS, AgeMark, Clocks, StoreAge
 from cairn_server.store.store_clock import ClockMark, clock_mark_from_text
 from cairn_server.store.store_rows import Branch, Fold, MapRow, NewCommit
@@ -165,21 +166,41 @@ class PgStore(PgReads):
             return True
 
         is_new = self._connections.run(job)
+        self._names = {}  # another server may have deleted the one that had the name
         row = self.map(name)
         check_same_map(name, (row.layer, row.sensor_model), (layer, sensor_model))
         return row, is_new
 
     def map(self, name: str) -> MapRow:
         """The map of a name."""
-        row, until_s = self._names.get(name, (None, 0.0))
+        names = self._names  # what is read before a deletion must not be known after it
+        row, until_s = names.get(name, (None, 0.0))
         now_s = time.monotonic()
         if row is not None and now_s < until_s:
             return row
         found = self.map_rows("WHERE name = %s", (name,))
         if found:
-            self._names[name] = found[0], now_s + NAMES_S
+            names[name] = found[0], now_s + NAMES_S
             return found[0]
-        raise NotFoundError("no_map", f"there is no map {name!r}; `cairn map ls` lists them")
+        with self._connections.lent() as connection:
+            raise missing_map(connection, name)
+
+    def delete_map(self, row: MapRow, *, by: str) -> GoneMap:
+        """Take a map out of the store for good, and end its tokens; durable on return."""
+        gone = self._connections.run(lambda connection: delete_map(connection, row, by=by))
+        self._names = {}
+        self.tokens.forget_known()
+        return gone
+
+    def clear_deleted(self, *, size_bytes_max: int) -> bool:
+        """Remove about so many bytes of what deleted maps left; False once nothing is left of them."""
+        with self._connections.lent() as connection:
+            if first(connection, DYING) is None:
+                return False
+        age_s = self.age.now_s()
+        return self._connections.run(
+            lambda connection: clear_part(connection, size_bytes_max=size_bytes_max, age_s=age_s)
+        )
 
     def newest_epoch(self, row: MapRow) -> Epoch:
         """Newest epoch of the commits of a map; `BASE` if none has one."""

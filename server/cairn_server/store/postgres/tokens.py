@@ -8,8 +8,10 @@ from dataclasses import dataclass, field
 
 from cairn_map.errors import ConflictError
 from cairn_map.wire.access_messages import AuditEntry, AuditText, audit_chain
+from cairn_server.map_refusals import GoneMap
 from cairn_server.store.known_tokens import KnownTokens, check_changed, token_row
 from cairn_server.store.postgres.connections import Connection, Connections, first, rows
+from cairn_server.store.postgres.failures import gone_of_token, lost_map
 from cairn_server.store.postgres.schema import NOW_S
 from cairn_server.store.postgres.writing_threads import WritingThreads
 from cairn_server.store.store_age import StoreAge
@@ -63,6 +65,9 @@ class PgTokens:
         values = (token.name, token.role, token.map_number, token.robot, secret_hash, token.created_s, token.expires_s)
 
         def job(connection: Connection) -> None:
+            known = "SELECT 1 FROM map WHERE map = %s"
+            if token.map_number is not None and first(connection, known, (token.map_number,)) is None:
+                raise lost_map(connection, token.map_number)
             if not connection.execute(query, (*values, self._age.now_s())).rowcount:
                 raise ConflictError("token_exists", f"a token {token.name!r} exists; rotate it, or take another name")
 
@@ -95,6 +100,11 @@ class PgTokens:
     def of_hash(self, secret_hash: bytes) -> Token | None:
         """The token of a secret, as it was at most a second ago, and not before it was changed here."""
         return self._known.get(secret_hash, lambda: self._look_up(secret_hash))
+
+    def gone(self, secret_hash: bytes) -> GoneMap | None:
+        """The deleted map with which the token of a secret ended."""
+        with self._connections.lent() as connection:
+            return gone_of_token(connection, secret_hash)
 
     def used(self, name: str) -> None:
         """Note that a token was shown just now; written some seconds later."""

@@ -56,9 +56,9 @@ def back_up(folder: Path, target: Path, report: Report) -> int:
         is_free = not target.exists()
     except OSError as exc:
         raise BadInputError("bad_backup", f"{target} cannot be written: {exc.strerror}") from exc
-    if not is_free and (target.samefile(source) or _version_of(target) not in range(1, len(STEPS) + 1)):
+    if not is_free and (target.samefile(source) or not is_backup(target)):
         raise BadInputError("bad_backup", f"{target} is there and is no backup of this cairn's; choose another name")
-    with _partial(target) as partial:
+    with partial_file(target) as partial:
         _copy(source, partial, report, shown=target)
     size_bytes = target.stat().st_size
     note_backup(folder, str(target.absolute()), size_bytes)
@@ -128,7 +128,7 @@ def restore(
             nothing can be written to the folder.
         DamagedDataError: the file is cut off; or what `verify` finds.
     """
-    _check_backup(source)
+    check_backup(source)
     try:
         folder.mkdir(0o700, parents=True, exist_ok=True)
         lock = lock_folder(folder)
@@ -138,20 +138,17 @@ def restore(
         found = sorted(path.name for path in folder.iterdir() if path.name not in (LOCK_NAME, LIST_NAME))
         if found:
             raise ConflictError("not_empty", f"{folder} is not empty, it has {found[0]}; restore into a new folder")
-        with _partial(folder / FILE_NAME) as partial:
-            _copy(source, partial, report, shown=folder / FILE_NAME)
-            _check_form(partial)
-            _migrate(partial)
-            verify(partial)
+        with partial_file(folder / FILE_NAME) as partial:
+            copy_checked(source, partial, report, verify, shown=folder / FILE_NAME)
             ended = ended_since((old or folder) / LIST_NAME, partial)
             restored = _without_ended(partial, ended, old)
-            _settle(partial)
+            settle_file(partial)
             if old is not None and ended is not None:
                 copy_list(old / LIST_NAME, folder / LIST_NAME)
     return restored
 
 
-def _check_backup(path: Path) -> None:
+def check_backup(path: Path) -> None:
     """Refuse a file that is no whole backup which this version can read; raises as `restore`."""
     try:
         size_bytes = path.stat().st_size
@@ -174,6 +171,23 @@ def _check_backup(path: Path) -> None:
         raise BadInputError("bad_backup", f"{path} is no backup of a cairn server")
     if version > len(STEPS):
         raise newer_store(f"the backup {path}", version)
+
+
+def copy_checked(source: Path, target: Path, report: Report, verify: Callable[[Path], None], *, shown: Path) -> None:
+    """Copy a store's file that somebody may have handed over, brought up to date; `verify` raises if it is not sound.
+
+    Raises:
+        DamagedDataError: kind `damaged_store`: it cannot be read; and what `verify` finds.
+    """
+    _copy(source, target, report, shown=shown)
+    _check_form(target)
+    _migrate(target)
+    verify(target)
+
+
+def is_backup(path: Path) -> bool:
+    """True if a file is a store that this version can read."""
+    return _version_of(path) in range(1, len(STEPS) + 1)
 
 
 def _version_of(path: Path) -> int:
@@ -223,7 +237,7 @@ def _copy(source: Path, target: Path, report: Report, *, shown: Path | None = No
     finally:
         from_store.close()
         to_file.close()
-    _settle(target)
+    settle_file(target)
 
 
 def _without_ended(path: Path, ended: Collection[bytes] | None, old: Path | None) -> Restored:
@@ -248,7 +262,9 @@ def _without_ended(path: Path, ended: Collection[bytes] | None, old: Path | None
 
 
 LOST = {
-    "commits": "SELECT count(*) FROM old.commits AS theirs JOIN old.map AS m ON m.number = theirs.map WHERE NOT EXISTS"
+    # No name has a slash but one of a deleted map, some of whose rows are left.
+    "commits": "SELECT count(*) FROM old.commits AS theirs JOIN old.map AS m ON m.number = theirs.map"
+    " WHERE m.name NOT LIKE '/%' AND NOT EXISTS"
     " (SELECT 1 FROM main.map JOIN main.commits AS ours ON ours.map = main.map.number WHERE main.map.name = m.name"
     " AND ours.robot = theirs.robot AND ours.incarnation = theirs.incarnation AND ours.n = theirs.n)",
     "audit lines": "SELECT count(*) FROM old.audit WHERE number > coalesce((SELECT max(number) FROM main.audit), 0)",
@@ -268,7 +284,7 @@ def _lost(connection: apsw.Connection, old: Path) -> dict[str, int] | None:
         return None
 
 
-def _settle(path: Path) -> None:
+def settle_file(path: Path) -> None:
     """Make a copy one file, without a separate log."""
     connection = apsw.Connection(str(path))
     try:
@@ -294,21 +310,28 @@ def _migrate(path: Path) -> None:
 
 
 @contextmanager
-def _partial(target: Path) -> Iterator[Path]:
-    """A file that takes the name of the target at the end, wholly on the disk; gone if anything fails."""
-    partial = target.with_name(f"{target.name}.{os.getpid()}.partial")
+def scratch_file(near: Path) -> Iterator[Path]:
+    """A file next to another one, gone at the end unless it was renamed."""
+    scratch = near.with_name(f"{near.name}.{os.getpid()}.partial")
     try:
-        partial.touch(0o600)
+        scratch.touch(0o600)
+        yield scratch
+    except (OSError, apsw.Error) as exc:
+        raise _cannot_write(exc, scratch, near) from exc
+    finally:
+        for side in SIDES:
+            with suppress(OSError):
+                scratch.with_name(scratch.name + side).unlink(missing_ok=True)
+
+
+@contextmanager
+def partial_file(target: Path) -> Iterator[Path]:
+    """A file that takes the name of the target at the end, wholly on the disk; gone if anything fails."""
+    with scratch_file(target) as partial:
         yield partial
         _sync(partial)
         partial.replace(target)
         _sync(target.parent)
-    except (OSError, apsw.Error) as exc:
-        raise _cannot_write(exc, partial, target) from exc
-    finally:
-        for side in SIDES:
-            with suppress(OSError):
-                partial.with_name(partial.name + side).unlink(missing_ok=True)
 
 
 def _cannot_write(exc: apsw.Error | OSError, path: Path, shown: Path) -> BadInputError:

@@ -9,6 +9,7 @@ from cairn_map.commits.cursor import ENTRY_FOLD, cursor_from_text
 from cairn_map.commits.ids import Author
 from cairn_map.errors import UnreachableError
 from cairn_server.store.sqlite.readers import Readers
+from cairn_server.store.sqlite.schema import MAPS
 from cairn_server.store.sqlite.writer import Writer, rows
 from cairn_server.store.store_rows import Branch, EntrySize, HeardRobot, MapRow
 
@@ -37,7 +38,7 @@ class SqliteBranchNotes:
     def heard(self, *, limit: int) -> list[HeardRobot]:
         """Robots of all maps by their last signs, the newest first."""
         query = (
-            "SELECT map.name, branch.name, last_seen_s FROM branch JOIN map ON map.number = branch.map"
+            f"SELECT map.name, branch.name, last_seen_s FROM branch JOIN {MAPS} ON map.number = branch.map"  # noqa: S608
             " ORDER BY last_seen_s DESC, 1, 2 LIMIT ?"
         )
         with self._readers.reading() as reader:

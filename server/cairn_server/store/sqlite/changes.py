@@ -7,8 +7,9 @@ import apsw
 from cairn_map.commits.cursor import ENTRY_FOLD
 from cairn_map.errors import ConflictError
 from cairn_server.store.history import KnownVectors, crosses_mark
-from cairn_server.store.sqlite.retention import check_kept, is_retracted, remember_evidence
+from cairn_server.store.sqlite.retention import check_kept, check_lives, count_kept, is_retracted, remember_evidence
 from cairn_server.store.sqlite.robot_keys import admit_commit
+from cairn_server.store.sqlite.schema import MAPS
 from cairn_server.store.sqlite.shares import give_back_sums, note_number, take_sums
 from cairn_server.store.sqlite.snapshot import SqliteSnapshot
 from cairn_server.store.sqlite.tile_rows import TileWriter, mark_at, recount_tile
@@ -20,6 +21,7 @@ from cairn_server.store.tiles import tile_of
 
 def append_commit(connection: apsw.Connection, row: MapRow, commit: NewCommit, *, age_s: float) -> bool:
     """Keep a commit at an age of the store; False if the same one is kept already."""
+    check_lives(connection, row.number)
     key = (row.number, *commit.id.author, commit.id.n)
     query = "SELECT number, sha, damaged, gone FROM commits WHERE map = ? AND robot = ? AND incarnation = ? AND n = ?"
     known = first(connection, query, key)
@@ -30,13 +32,14 @@ def append_commit(connection: apsw.Connection, row: MapRow, commit: NewCommit, *
         if damaged is not None:
             _repair(connection, number, commit)
         elif gone and not is_retracted(connection, row, commit.id):
-            remember_evidence(connection, number, commit, age_s=age_s)
+            remember_evidence(connection, row, number, commit, age_s=age_s)
             _insert_diff(connection, number, commit)
         return damaged is not None
     check_kept(connection, row, commit.retracts)
     admit_commit(connection, row, commit.id.author, commit.grounds)
     note_number(connection, row, commit.id, is_carried=commit.via is not None)
     charged = take_sums(connection, row, commit)
+    count_kept(connection, row, commit.id.author, commit.size_bytes)
     connection.execute(
         "INSERT INTO commits (map, robot, incarnation, n, sha, size_bytes, cells, meta, captured_first_s,"
         " captured_last_s, retracts, received_s, received_age_s, rig, signatures, via, charged, bricks, epoch)"
@@ -71,7 +74,7 @@ def next_number(connection: apsw.Connection, row: MapRow, author: tuple[str, str
 
 def write_fold(connection: apsw.Connection, row: MapRow, fold: Fold, *, age_s: float) -> bool:
     """Cells, entries and head at an age of the store, if head and retracts are still where the fold begins."""
-    head = first(connection, "SELECT seq, chain FROM map WHERE number = ?", (row.number,))
+    head = first(connection, f"SELECT seq, chain FROM {MAPS} WHERE number = ?", (row.number,))  # noqa: S608
     if head != (fold.base.seq, fold.base.chain):
         return False
     # A part in which no commit was there to be taken out leaves the head where it is.
@@ -133,6 +136,7 @@ def _write_cells(connection: apsw.Connection, row: MapRow, fold: Fold) -> None:
 
 def heal_cell(connection: apsw.Connection, row: MapRow, cell: CellRow) -> bool:
     """Put sound bytes in the place of a damaged cell; False if it changed meanwhile."""
+    check_lives(connection, row.number)
     query = "SELECT 1 FROM cell INDEXED BY cell_listed WHERE map = ? AND cell = ? AND lm = ?"
     if not first(connection, query, (row.number, cell.key, cell.lm)):
         return False

@@ -3,9 +3,9 @@
     LIST_NAME    first line: the list's id; then the SHA-256 of each secret that ended, in hex, a line each
     ended_list   the same id, in the store and so in every backup of it
 
-A token ends when it is revoked, rotated or replaced by a registration, or when its robot is deregistered. Its line is
-on the disk before that is written to the store, and before it is answered. A list says all that ended since a backup if
-the backup bears its id: a new list, with another id, begins where a folder has none.
+A token ends when it is revoked, rotated or replaced by a registration, or when its robot is deregistered or its map
+deleted. Its line is on the disk before that is written to the store, and before it is answered. A list says all that
+ended since a backup if the backup bears its id: a new list, with another id, begins where a folder has none.
 """
 
 import os
@@ -48,6 +48,10 @@ class EndedTokens:
     def note_robot(self, connection: apsw.Connection, map_number: int, robot: str) -> None:
         """Write down the hashes of a robot's tokens, before a job deletes them; raises as `_note`."""
         self._note(rows(connection, "SELECT hash FROM token WHERE map = ? AND robot = ?", (map_number, robot)))
+
+    def note_map(self, connection: apsw.Connection, map_number: int) -> None:
+        """Write down the hashes of a map's tokens, before a job deletes them; raises as `_note`."""
+        self._note(rows(connection, "SELECT hash FROM token WHERE map = ?", (map_number,)))
 
     def _note(self, found: list[tuple[bytes]]) -> None:
         """Write down hashes.

@@ -16,6 +16,7 @@ from cairn_map.codec.cell_code import decode_cell
 from cairn_map.errors import CairnError
 from cairn_map.evidence.evidence import largest
 from cairn_server.store.shares import RESERVE, Tops, limits_of
+from cairn_server.store.sqlite.schema import MAPS
 from cairn_server.store.sqlite.writer import first
 
 log = logging.getLogger(__name__)
@@ -31,7 +32,7 @@ def measure_old_sums(connection: apsw.Connection) -> None:
 
     That reads every cell of such a map, some milliseconds each. A map with a damaged cell stays as it is.
     """
-    for number, name in list(connection.execute("SELECT number, name FROM map")):
+    for number, name in list(connection.execute(f"SELECT number, name FROM {MAPS}")):  # noqa: S608 - our own clause
         old = old_sums(connection, number)
         if not any(map(gt, old, limits_of(RESERVE, len(old)))):
             continue

@@ -12,7 +12,7 @@ from cairn_map.evidence.grid import CellKey, Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.store.history import KnownVectors
 from cairn_server.store.sqlite.readers import Readers
-from cairn_server.store.sqlite.schema import WAITING, WAITING_MAPS
+from cairn_server.store.sqlite.schema import MAPS, WAITING, WAITING_MAPS
 from cairn_server.store.sqlite.snapshot import SqliteSnapshot
 from cairn_server.store.sqlite.writer import Values, first, rows
 from cairn_server.store.store_rows import MapRow, StoredCommit
@@ -33,7 +33,7 @@ class SqliteReads:
 
     def heads(self, numbers: Collection[int] | None = None) -> list[tuple[MapRow, Cursor]]:
         """All maps, or those of these numbers that there are, with their present states."""
-        query = "SELECT number, seal_key, log_id, seq, chain FROM map"
+        query = f"SELECT number, seal_key, log_id, seq, chain FROM {MAPS}"  # noqa: S608 - our own clause
         with self._readers.reading() as reader:
             if numbers is None:
                 found = rows(reader, f"{query} ORDER BY name")
@@ -102,7 +102,7 @@ class SqliteReads:
     def map_rows(self, clause: str, values: Values) -> list[MapRow]:
         """Maps that fit a clause of ours."""
         with self._readers.reading() as reader:
-            found = rows(reader, f"SELECT number, seal_key FROM map {clause}", values)  # noqa: S608 - our own clause
+            found = rows(reader, f"SELECT number, seal_key FROM {MAPS} {clause}", values)  # noqa: S608 - our own clause
             return [self._map_row(reader, number, seal_key) for number, seal_key in found]
 
     def _map_row(self, reader: apsw.Connection, number: int, seal_key: bytes) -> MapRow:

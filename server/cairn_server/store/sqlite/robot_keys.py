@@ -7,6 +7,7 @@ import apsw
 from cairn_map.commits.ids import SERVERS_OWN, Author, Incarnation, RobotName
 from cairn_server.store.admission import Grounds, RobotKey, check_commit, check_registration
 from cairn_server.store.sqlite.readers import Readers
+from cairn_server.store.sqlite.retention import check_lives
 from cairn_server.store.sqlite.writer import Writer, first, rows
 from cairn_server.store.store_rows import MapRow
 
@@ -32,7 +33,12 @@ class SqliteAdmittedKeys:
 
     def admit(self, row: MapRow, author: Author, *, by: str) -> None:
         """Admit a key by an operator's word; durable on return."""
-        self._writer.run(lambda connection: _put(connection, row, author, may_return=True, by=by))
+
+        def job(connection: apsw.Connection) -> None:
+            check_lives(connection, row.number)
+            _put(connection, row, author, may_return=True, by=by)
+
+        self._writer.run(job)
 
 
 def admit_commit(connection: apsw.Connection, row: MapRow, author: Author, grounds: Grounds) -> None:

@@ -22,6 +22,9 @@ WAITING_MAPS = (
 IS_MEASURED = "folded_seq IS NOT NULL AND unfolded_seq IS NULL AND cells > 0 AND captured_last_s <= received_s + 600"
 """SQL of the commits in the map that say credibly when they were captured; seconds of `CAPTURED_AHEAD_MAX_S`."""
 
+MAPS = "(SELECT * FROM map WHERE number NOT IN (SELECT number FROM gone_map)) AS map"
+"""SQL of the maps that were not deleted; rows of others in `map` are there for other rows that refer to them."""
+
 FIRST = """
 CREATE TABLE map (
     number INTEGER PRIMARY KEY,
@@ -313,6 +316,37 @@ ADDRESSES = """
 ALTER TABLE audit ADD COLUMN client TEXT NOT NULL DEFAULT '';       -- address that a request came from
 """
 
+GONE = """
+CREATE TABLE gone_map (                             -- deleted; as long as `map` has its number, rows of it are left
+    number INTEGER PRIMARY KEY,
+    name TEXT NOT NULL,
+    deleted_s REAL NOT NULL,
+    by TEXT NOT NULL                -- name of the token
+);
+CREATE TABLE gone_token (                           -- that ended with its map
+    hash BLOB PRIMARY KEY,
+    map INTEGER NOT NULL
+) WITHOUT ROWID;
+-- Without a reference to commits: to remove one would look through the whole log for its number.
+CREATE TABLE log_without_reference (
+    map INTEGER NOT NULL REFERENCES map,
+    seq INTEGER NOT NULL,
+    kind BLOB NOT NULL,
+    commit_number INTEGER NOT NULL,
+    chain BLOB NOT NULL,
+    PRIMARY KEY (map, seq)
+) WITHOUT ROWID;
+INSERT INTO log_without_reference SELECT map, seq, kind, commit_number, chain FROM log;
+DROP TABLE log;
+ALTER TABLE log_without_reference RENAME TO log;
+ALTER TABLE author ADD COLUMN kept_bytes INTEGER NOT NULL DEFAULT 0;    -- of its commits whose evidence is not gone
+UPDATE author SET kept_bytes = coalesce((
+    SELECT sum(size_bytes) FROM commits
+    WHERE commits.map = author.map AND commits.robot = author.robot AND commits.incarnation = author.incarnation
+        AND gone = 0
+), 0);
+"""
+
 STEPS = (
     FIRST,
     STAMPS,
@@ -332,6 +366,7 @@ STEPS = (
     EPOCHS,
     CLOCK,
     ADDRESSES,
+    GONE,
 )
 
 

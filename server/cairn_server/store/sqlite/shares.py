@@ -29,6 +29,8 @@ from cairn_server.store.shares import (
 )
 from cairn_server.store.sqlite.old_sums import old_sums
 from cairn_server.store.sqlite.readers import Readers
+from cairn_server.store.sqlite.retention import check_lives
+from cairn_server.store.sqlite.schema import MAPS
 from cairn_server.store.sqlite.writer import Writer, first, rows
 from cairn_server.store.store_rows import ClosedRobot, MapRow, NewCommit, RobotShares, UsedPart
 
@@ -147,7 +149,8 @@ class SqliteShares:
     def full_sums(self) -> list[UsedPart]:
         """Shares of the sums of which more than half is used, of all maps, along the index of these."""
         query = (
-            "SELECT name, account, max(part) FROM held JOIN map ON map.number = held.map"  # noqa: S608 - our own number
+            "SELECT name, account, max(part) FROM held"  # noqa: S608 - our own number
+            f" JOIN {MAPS} ON map.number = held.map"
             f" WHERE part > {ALARM_PART} GROUP BY map.number, account"
         )
         with self._readers.reading() as reader:
@@ -156,14 +159,14 @@ class SqliteShares:
     def full_authors(self) -> list[UsedPart]:
         """The same of incarnations, intervals and robots."""
         accounts = f"CASE WHEN {IS_RESERVE} THEN '{RESERVE}' ELSE robot END"
-        name = "(SELECT name FROM map WHERE number = author.map)"
+        name, is_there = "map.name", f"JOIN {MAPS} ON map.number = author.map"
         authors = (
-            f"SELECT {name}, {accounts} AS account, count(*), sum(intervals) FROM author"  # noqa: S608 - our own clauses
-            " GROUP BY map, account HAVING count(*) > ? OR sum(intervals) > ?"
+            f"SELECT {name}, {accounts} AS account, count(*), sum(intervals) FROM author {is_there}"  # noqa: S608 - our own clauses
+            " GROUP BY author.map, account HAVING count(*) > ? OR sum(intervals) > ?"
         )
         robots = (
-            f"SELECT {name}, count(DISTINCT robot) FROM author WHERE NOT {IS_RESERVE}"  # noqa: S608 - our own clauses
-            " GROUP BY map HAVING count(DISTINCT robot) > ?"
+            f"SELECT {name}, count(DISTINCT robot) FROM author {is_there} WHERE NOT {IS_RESERVE}"  # noqa: S608 - our own clauses
+            " GROUP BY author.map HAVING count(DISTINCT robot) > ?"
         )
         with self._readers.transaction() as reader:
             much = rows(reader, authors, LEAST_FULL)
@@ -178,7 +181,12 @@ class SqliteShares:
 
     def close(self, row: MapRow, robot: str) -> ClosedRobot:
         """Close all authors of a robot, and move what they hold into the reserve. Durable on return."""
-        return self._writer.run(lambda connection: close_robot(connection, row, robot))
+
+        def job(connection: apsw.Connection) -> ClosedRobot:
+            check_lives(connection, row.number)
+            return close_robot(connection, row, robot)
+
+        return self._writer.run(job)
 
 
 def _uses(connection: apsw.Connection, row: MapRow, robot: str) -> tuple[int, int, int]:

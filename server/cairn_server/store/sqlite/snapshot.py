@@ -16,6 +16,7 @@ from cairn_map.evidence.grid import CellKey
 from cairn_map.wire.messages import LogEntry
 from cairn_server.store.history import KnownVectors
 from cairn_server.store.sqlite.failures import damaged_pages
+from cairn_server.store.sqlite.retention import check_lives
 from cairn_server.store.sqlite.schema import IS_MEASURED
 from cairn_server.store.sqlite.tile_rows import CELL_COLUMNS, IN_TILES, fingerprint_in_box, tiles_changed, totals_of
 from cairn_server.store.sqlite.writer import first, rows
@@ -51,6 +52,7 @@ class SqliteSnapshot:
         self._map = map_number
         self._layer_digest = layer_digest
         self._vectors = vectors
+        check_lives(connection, map_number)
         self._head = Cursor(*first(connection, "SELECT log_id, seq, chain FROM map WHERE number = ?", (map_number,)))
 
     @property
@@ -262,9 +264,10 @@ class SqliteSnapshot:
         sums, corners = totals_of(self._connection, self._map)
         query = (
             "SELECT folded + (SELECT count(*) FROM commits WHERE map = ?1 AND folded_seq IS NULL AND damaged IS NULL),"
-            " (SELECT count(*) FROM branch WHERE map = ?1) FROM map WHERE number = ?1"
+            " (SELECT count(*) FROM branch WHERE map = ?1),"
+            " (SELECT coalesce(sum(kept_bytes), 0) FROM author WHERE map = ?1) FROM map WHERE number = ?1"
         )
-        commits, branches = first(self._connection, query, (self._map,))
+        commits, branches, evidence_bytes = first(self._connection, query, (self._map,))
         return Totals(
             cells=sums.cells,
             size_bytes=sums.size_bytes,
@@ -272,6 +275,7 @@ class SqliteSnapshot:
             branches=branches,
             corner_cells=corners,
             history_bytes=sums.history_bytes,
+            evidence_bytes=evidence_bytes,
         )
 
 

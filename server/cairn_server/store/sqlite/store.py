@@ -21,6 +21,7 @@ from cairn_map.errors import BadInputError, NotFoundError, UnreachableError
 from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.wire.access_messages import AuditText
+from cairn_server.map_refusals import GoneMap, check_same_map
 from cairn_server.store.admission import OWN_WORD, Grounds
 from cairn_server.store.branch_signs import LastSeen
 from cairn_server.store.folder_lock import lock_folder
@@ -32,9 +33,17 @@ from cairn_server.store.sqlite.failures import FULL, disk_full, opening_failure
 from cairn_server.store.sqlite.old_sums import measure_old_sums
 from cairn_server.store.sqlite.readers import Readers
 from cairn_server.store.sqlite.reads import SqliteReads
-from cairn_server.store.sqlite.retention import forget_evidence
+from cairn_server.store.sqlite.retention import (
+    DYING,
+    check_lives,
+    clear_part,
+    delete_map,
+    forget_evidence,
+    missing_map,
+    next_map_number,
+)
 from cairn_server.store.sqlite.robot_keys import SqliteAdmittedKeys, admit_registration
-from cairn_server.store.sqlite.schema import WAITING, WAITING_MAPS, ensure_schema
+from cairn_server.store.sqlite.schema import MAPS, WAITING, WAITING_MAPS, ensure_schema
 from cairn_server.store.sqlite.shares import SqliteShares
 from cairn_server.store.sqlite.tile_rows import fill_tiles
 from cairn_server.store.sqlite.tokens import (
@@ -45,7 +54,6 @@ from cairn_server.store.sqlite.tokens import (
     write_audit,
 )
 from cairn_server.store.sqlite.writer import Writer, connect, first, rows
-from cairn_server.store.store import check_same_map
 from cairn_server.store.store_age import CLOCKS, AgeMark, Clocks, StoreAge
 from cairn_server.store.store_clock import ClockMark, clock_mark_from_text
 from cairn_server.store.store_rows import (
@@ -65,6 +73,12 @@ from cairn_server.store.store_rows import (
 
 PROBE_S = 5.0
 """Time in which the writer gets to a probe, unless it does not keep up."""
+INCREMENTAL = 2
+"""`PRAGMA auto_vacuum` of a file whose unused pages can be given back one by one."""
+UNUSED_PAGES_MAX, UNUSED_SHARE_MAX = 1024, 0.125
+"""Unused pages, 16 MB, and their share of the file, above both of which they are given back: fewer are used again."""
+SHRINK_PAGES = 64
+"""Most pages that are given back in one transaction: 1 MB."""
 MAPS_MAX = 1000
 """Most maps whose backlogs are listed."""
 
@@ -161,12 +175,13 @@ class SqliteStore(SqliteReads):
                 known = MapLayer(geometry=Geometry.model_validate_json(found[0]), epoch_s=found[1])
                 check_same_map(name, (known, SensorModel.model_validate_json(found[2])), (layer, sensor_model))
                 return False
-            log_id = secrets.token_bytes(16)
+            number, log_id = next_map_number(connection), secrets.token_bytes(16)
             tops = [0] * (2 + geometry.plane_count)
             connection.execute(
-                "INSERT INTO map (name, geometry, sensor_model, operator, log_id, seq, chain, tops, epoch_s, seal_key)"
-                " VALUES (?, ?, ?, ?, ?, 0, ?, ?, ?, randomblob(32))",
+                "INSERT INTO map (number, name, geometry, sensor_model, operator, log_id, seq, chain, tops, epoch_s,"
+                " seal_key) VALUES (?, ?, ?, ?, ?, ?, 0, ?, ?, ?, randomblob(32))",
                 (
+                    number,
                     name,
                     geometry.model_dump_json(),
                     sensor_model.model_dump_json(),
@@ -184,14 +199,30 @@ class SqliteStore(SqliteReads):
 
     def map(self, name: str) -> MapRow:
         """The map of a name."""
-        kept = self._names.get(name)
+        names = self._names  # what is read before a deletion must not be known after it
+        kept = names.get(name)
         if kept is not None:
             return kept
         found = self.map_rows("WHERE name = ?", (name,))
         if found:
-            self._names[name] = found[0]
+            names[name] = found[0]
             return found[0]
-        raise NotFoundError("no_map", f"there is no map {name!r}; `cairn map ls` lists them")
+        with self._readers.reading() as reader:
+            raise missing_map(reader, name)
+
+    def delete_map(self, row: MapRow, *, by: str) -> GoneMap:
+        """Take a map out of the store for good, and end its tokens; durable on return."""
+        gone = self._writer.run(lambda connection: delete_map(connection, row, self._ended, by=by))
+        self._names = {}
+        self.tokens.forget_known()
+        return gone
+
+    def clear_deleted(self, *, size_bytes_max: int) -> bool:
+        """Remove about so many bytes of what deleted maps left; False once nothing is left of them."""
+        with self._readers.reading() as reader:
+            if first(reader, DYING) is None:
+                return False
+        return self._writer.run(lambda connection: clear_part(connection, size_bytes_max=size_bytes_max))
 
     def newest_epoch(self, row: MapRow) -> Epoch:
         """Newest epoch of the commits of a map; `BASE` if none has one."""
@@ -219,9 +250,12 @@ class SqliteStore(SqliteReads):
 
     def forget_evidence(self, row: MapRow, *, before_s: float, limit: int) -> int:
         """Drop the evidence and the meta of up to `limit` commits folded, and last pushed, before an age; how many."""
-        return self._writer.run(
-            lambda connection: forget_evidence(connection, row, before_s, limit, age_s=self.age.now_s())
-        )
+
+        def job(connection: apsw.Connection) -> int:
+            check_lives(connection, row.number)
+            return forget_evidence(connection, row, before_s, limit, age_s=self.age.now_s())
+
+        return self._writer.run(job)
 
     def fold(self, row: MapRow, fold: Fold) -> bool:
         """Write a fold if the head is still its base; False (and nothing written) otherwise."""
@@ -236,6 +270,7 @@ class SqliteStore(SqliteReads):
         values = (row.number, branch.name, branch.mode, sensors, branch.last_seen_s, branch.incarnation)
 
         def job(connection: apsw.Connection) -> None:
+            check_lives(connection, row.number)
             admit_registration(connection, row, author, grounds)
             connection.execute(
                 "INSERT INTO branch (map, name, mode, sensors, last_seen_s, incarnation) VALUES (?, ?, ?, ?, ?, ?)"
@@ -371,6 +406,7 @@ class SqliteHealth:
         self._writer = writer
         self._readers = readers
         self._age = age
+        self._is_shrinking = False
 
     def backlogs(self) -> list[Backlog]:
         """Commits that are not folded yet, or whose retract is under way, of the maps that have any."""
@@ -378,7 +414,7 @@ class SqliteHealth:
         waiting = WAITING.replace("?1", "map.number")
         query = (
             f"SELECT name, (SELECT count(*) FROM {waiting}), (SELECT received_age_s FROM commits"  # noqa: S608 - our own clause
-            f" WHERE number = (SELECT min(number) FROM {waiting})) FROM map WHERE number IN ({WAITING_MAPS})"
+            f" WHERE number = (SELECT min(number) FROM {waiting})) FROM {MAPS} WHERE number IN ({WAITING_MAPS})"
             " ORDER BY map.number LIMIT ?"
         )
         with self._readers.reading() as reader:
@@ -389,8 +425,10 @@ class SqliteHealth:
     def figures(self) -> StoreFigures:
         """Sizes and counts."""
         with self._readers.reading() as reader:
-            sums = "SELECT coalesce(sum(cells_bytes), 0), coalesce(sum(history_bytes), 0) FROM map"
-            cells_bytes, history_bytes = first(reader, sums)
+            kept = "(SELECT sum(kept_bytes) FROM author WHERE map = map.number)"
+            sums = ", ".join(f"coalesce(sum({each}), 0)" for each in ("cells_bytes", "history_bytes", kept, "seq"))
+            cells_bytes, history_bytes, evidence_bytes, entries = first(reader, f"SELECT {sums} FROM {MAPS}")  # noqa: S608
+            unused_bytes = reader.pragma("freelist_count") * reader.pragma("page_size")
         return StoreFigures(
             size_bytes=self._path.stat().st_size,
             ahead_bytes=self._writer.checkpoints.size_bytes(),
@@ -401,6 +439,9 @@ class SqliteHealth:
             failures=dict(self._writer.failures),
             cells_bytes=cells_bytes,
             history_bytes=history_bytes,
+            evidence_bytes=evidence_bytes,
+            log_entries=entries,
+            unused_bytes=unused_bytes,
         )
 
     def check_space(self, free_bytes_min: int) -> None:
@@ -413,6 +454,17 @@ class SqliteHealth:
                 f"{free_bytes} bytes are free on the server's disk, it keeps {free_bytes_min}; make room, or lower "
                 "the setting disk_free_min_bytes"
             )
+
+    def shrink(self) -> bool:
+        """Give a bounded part of the file's unused pages back to the disk; True while that is under way."""
+        with self._readers.reading() as reader:
+            pages, unused = reader.pragma("page_count"), reader.pragma("freelist_count")
+            if reader.pragma("auto_vacuum") != INCREMENTAL:
+                return False
+        self._is_shrinking = unused > (0 if self._is_shrinking else max(UNUSED_PAGES_MAX, UNUSED_SHARE_MAX * pages))
+        if self._is_shrinking:
+            self._writer.run(lambda connection: rows(connection, f"PRAGMA incremental_vacuum({SHRINK_PAGES})"))
+        return self._is_shrinking
 
     def heal(self, row: MapRow, cell: CellRow) -> bool:
         """Put sound bytes in the place of a damaged cell; False if it changed meanwhile."""

@@ -139,7 +139,7 @@ def mark_at(connection: apsw.Connection, map_number: int, seq: int, vector: Vers
 def fill_tiles(connection: apsw.Connection) -> None:
     """Make the tiles, totals and marks of all maps; some microseconds a cell and a log entry."""
     connection.execute("DELETE FROM tile; DELETE FROM vector_mark")
-    for (number,) in rows(connection, "SELECT number FROM map"):
+    for (number,) in rows(connection, "SELECT number FROM map WHERE number NOT IN (SELECT number FROM gone_map)"):
         sums: dict[int, TileSums] = {}
         query = f"SELECT cell >> {TILE_BITS}, {SUM_COLUMNS} FROM cell WHERE map = ?"  # noqa: S608
         for tile, *cell in connection.execute(query, (number,)):

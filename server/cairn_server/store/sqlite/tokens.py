@@ -10,9 +10,11 @@ import apsw
 
 from cairn_map.errors import ConflictError, UnreachableError
 from cairn_map.wire.access_messages import AuditEntry, AuditText, audit_chain
+from cairn_server.map_refusals import GoneMap
 from cairn_server.store.known_tokens import KnownTokens, check_changed, token_row
 from cairn_server.store.sqlite.ended_tokens import EndedTokens
 from cairn_server.store.sqlite.readers import Readers
+from cairn_server.store.sqlite.retention import check_lives, gone_of_token
 from cairn_server.store.sqlite.writer import Writer, first, rows
 from cairn_server.store.store_age import StoreAge
 from cairn_server.store.store_rows import (
@@ -60,6 +62,8 @@ class SqliteTokens:
         """Keep a new token."""
 
         def job(connection: apsw.Connection) -> None:
+            if token.map_number is not None:
+                check_lives(connection, token.map_number)
             if first(connection, "SELECT 1 FROM token WHERE name = ?", (token.name,)):
                 raise ConflictError("token_exists", f"a token {token.name!r} exists; rotate it, or take another name")
             connection.execute(
@@ -124,6 +128,11 @@ class SqliteTokens:
     def of_hash(self, secret_hash: bytes) -> Token | None:
         """The token of a secret, as it was at most a second ago, and not before it was changed."""
         return self._known.get(secret_hash, lambda: self._look_up(secret_hash))
+
+    def gone(self, secret_hash: bytes) -> GoneMap | None:
+        """The deleted map with which the token of a secret ended."""
+        with self._readers.reading() as reader:
+            return gone_of_token(reader, secret_hash)
 
     def used(self, name: str) -> None:
         """Note that a token was shown just now; written some seconds later."""

@@ -59,6 +59,9 @@ def connect(path: Path) -> apsw.Connection:
     connection = apsw.Connection(str(path))
     connection.set_busy_timeout(BUSY_MS)
     connection.execute("PRAGMA page_size = 16384")
+    # Of a new file: its unused pages can be given back one by one. Of any other, the pragma would be a write.
+    if not connection.pragma("page_count"):
+        connection.execute("PRAGMA auto_vacuum = INCREMENTAL")
     connection.execute("PRAGMA journal_mode = WAL")
     # FULL: COMMIT returns only after the log is on the disk, and every acknowledgement rests on that.
     connection.execute("PRAGMA synchronous = FULL")

@@ -1,0 +1,63 @@
+"""Refusals that concern a map as a whole: its name is taken by another one, was never given, or it was deleted."""
+
+from dataclasses import dataclass
+from datetime import UTC, datetime
+
+from cairn_map.epochs.layer import MapLayer
+from cairn_map.errors import ConflictError, NotFoundError
+from cairn_map.evidence.inverse_sensor_model import SensorModel
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GoneMap:
+    """A map that an administrator deleted; its number is given to no other one, its name may be."""
+
+    number: int
+    name: str
+    deleted_s: float
+    """Time of the deletion, UTC seconds since 1970."""
+    by: str
+    """Name of the token by which it was deleted."""
+
+
+def map_gone(gone: GoneMap) -> NotFoundError:
+    """Error for a deleted map, of kind `gone`: the time of it, and the ways on for the owner of one of its robots."""
+    when = datetime.fromtimestamp(gone.deleted_s, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+    return NotFoundError(
+        "gone",
+        f"map {gone.name} was deleted on {when}, and its tokens ended. A robot's folder keeps all that is in it, "
+        "commits that wait, too. An administrator can bring the map back out of an archive, or make a map of this name "
+        "again; the robot goes on there once an operator lets it in (`cairn map robots admit`)",
+    )
+
+
+def no_map(name: str) -> NotFoundError:
+    """Error for a name that no map has or had."""
+    return NotFoundError("no_map", f"there is no map {name!r}; `cairn map ls` lists them")
+
+
+def check_same_map(name: str, known: tuple[MapLayer, SensorModel], asked: tuple[MapLayer, SensorModel]) -> None:
+    """Refuse to make a map of a name that another one has.
+
+    Raises:
+        ConflictError: kind `map_exists`.
+    """
+    way_out = "Use it as it is, or take another name"
+    (layer, sensor_model), (other_layer, other_model) = known, asked
+    if layer.geometry != other_layer.geometry:
+        raise ConflictError(
+            "map_exists", f"map {name} exists with {layer.geometry}; asked for were {other_layer.geometry}. {way_out}"
+        )
+    if layer.epoch_s != other_layer.epoch_s:
+        raise ConflictError(
+            "map_exists",
+            f"map {name} exists {_epochs_text(layer)}; asked for was one {_epochs_text(other_layer)}. {way_out}",
+        )
+    if sensor_model != other_model:
+        raise ConflictError(
+            "map_exists", f"map {name} exists with {sensor_model!r}; asked for was {other_model!r}. {way_out}"
+        )
+
+
+def _epochs_text(layer: MapLayer) -> str:
+    return "without epochs" if layer.epoch_s is None else f"with epochs of {layer.epoch_s} s"
