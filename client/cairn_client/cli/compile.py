@@ -19,7 +19,7 @@ from collections.abc import Callable, Collection, Iterator
 from importlib.metadata import entry_points
 
 from cairn_client.cli.arguments import parser
-from cairn_map.kernels.kernel_cache import forget_kernels, is_warm, mark_warm
+from cairn_map.kernels.kernel_cache import forget_kernels, mark_warm
 from cairn_map.kernels.numba_runtime import show_compiling
 
 GROUP = "cairn.warm_up"
@@ -39,8 +39,7 @@ def main(argv: list[str]) -> int:
     for name, warm_up in list(_warm_ups(wanted)):  # all loaded first, so that all kernels are counted from the start
         start_s = time.monotonic()
         package = warm_up.__module__.partition(".")[0]
-        if not is_warm(package):
-            forget_kernels(package)
+        forget_kernels(package)
         warm_up()
         mark_warm(package)
         sys.stdout.write(f"{name}: ready after {time.monotonic() - start_s:.1f} s\n")

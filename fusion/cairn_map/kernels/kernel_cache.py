@@ -51,7 +51,7 @@ def keep_kernels(spare: Path | None) -> None:
     A later call names another spare folder, which counts for kernels that were not called yet.
     """
     _Spare.folder = spare
-    dispatcher.FunctionCache = KernelCache
+    dispatcher.FunctionCache = KernelCache  # type: ignore[attr-defined]
 
 
 def home_folder() -> Path | None:
@@ -96,11 +96,17 @@ def drop_other_versions() -> None:
 
 
 def forget_kernels(package: str) -> None:
-    """Remove a package's kernels from the first place: another version may have left them there."""
-    for source in _sources(package):
-        for path in _first_part(source).glob(f"{source.stem}.*.nb[ic]"):
-            with suppress(OSError):
-                path.unlink()
+    """Remove a package's kernels from the first place, once for each version: another one may have left them there."""
+    folder = _first_folder()
+    begun = _mark(folder, f"{package}.begun")
+    if begun.exists() or not _may_write(folder):
+        return
+    with _errors_logged():
+        for source in _sources(package):
+            for path in _first_part(source).glob(f"{source.stem}.*.nb[ic]"):
+                path.unlink(missing_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
+        begun.touch()
 
 
 @cache
@@ -121,7 +127,7 @@ def _sources(package: str) -> list[Path]:
     return sorted(path for folder in folders for path in Path(folder).rglob("*_kernels.py"))
 
 
-class KernelCache(_Cache):  # type: ignore[misc]
+class KernelCache(_Cache):
     """Cache of one kernel, instead of Numba's; folders are looked for when it is first called, not when it is made."""
 
     def __init__(self, py_func: FunctionType) -> None:
@@ -207,7 +213,7 @@ class _Locator(InTreeCacheLocator):
 class _Impl(CompileResultCacheImpl):
     """Numba's form of compiled kernels."""
 
-    _locator_classes = [_Locator]  # type: ignore[assignment]  # noqa: RUF012 - as in Numba
+    _locator_classes = [_Locator]  # noqa: RUF012 - as in Numba
 
 
 class _FolderCache(FunctionCache):

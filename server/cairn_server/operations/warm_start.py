@@ -14,7 +14,7 @@ from types import TracebackType
 from typing import Self
 
 from cairn_map.kernels.compilers import Compilers, CompilersError
-from cairn_map.kernels.kernel_cache import drop_other_versions, is_warm, kept_folder, mark_warm
+from cairn_map.kernels.kernel_cache import drop_other_versions, forget_kernels, is_warm, kept_folder, mark_warm
 from cairn_map.kernels.numba_runtime import is_compiled, known_kernels
 from cairn_map.warm_up import SERVER_KERNELS, SERVER_PARTS
 from cairn_server.http.middleware.log_format import fields
@@ -43,6 +43,7 @@ class WarmStart:
 
     def __enter__(self) -> Self:
         if self._is_needed:
+            forget_kernels(PACKAGE)
             self._compilers = Compilers(f"{PACKAGE}.warm_up", list(SERVER_PARTS))
             self._thread.start()
         return self

@@ -14,7 +14,15 @@ import numba
 import pytest
 
 from cairn_map.kernels import kernel_cache
-from cairn_map.kernels.kernel_cache import KernelCache, digest, drop_other_versions, is_warm, kept_folder, mark_warm
+from cairn_map.kernels.kernel_cache import (
+    KernelCache,
+    digest,
+    drop_other_versions,
+    forget_kernels,
+    is_warm,
+    kept_folder,
+    mark_warm,
+)
 
 SOURCE = """
 import numba
@@ -107,6 +115,17 @@ def test_a_folder_that_turns_out_to_be_full_is_said_once(
         assert [used(source), used(source)] == [1, 1]
     assert [record.levelname for record in caplog.records] == ["WARNING"]
     assert "No space left on device" in caplog.text
+
+
+def test_kernels_of_another_version_are_forgotten_once(folders: tuple[Path, Path]) -> None:
+    """A kernel holds code of those that it calls, so that one of the version before would be wrong."""
+    source = next(path for path in kernel_cache._sources("cairn_map") if path.stem == "morton_kernels")
+    kept = kernel_cache._first_part(source) / "morton_kernels.interleave-40.py311.nbi"
+    kept.parent.mkdir(parents=True)
+    for there in (False, True):
+        kept.touch()
+        forget_kernels("cairn_map")
+        assert kept.exists() is there
 
 
 def test_other_versions_leave_the_spare_folder(folders: tuple[Path, Path]) -> None:

@@ -32,7 +32,7 @@ class Service:
         self.data = place / "data"
         self.data.mkdir()
         self._code = place / "code"
-        left_out = ["*.pyc", "static"] if kernels else ["__pycache__", "static"]
+        left_out = ["static", *(() if kernels else ("*.nbi", "*.nbc", "cairn_*-*"))]
         for package, folder in FOLDERS.items():
             shutil.copytree(ROOT / folder / package, self._code / package, ignore=shutil.ignore_patterns(*left_out))
         for path in (self._code, *self._code.rglob("*")):
