@@ -30,7 +30,7 @@ from typing import Any
 import numba
 from llvmlite import binding
 from numba.core import config, dispatcher
-from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile, InTreeCacheLocator, _Cache
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile, InTreeCacheLocator
 
 log = logging.getLogger(__name__)
 
@@ -43,6 +43,8 @@ class _Spare:
     """The spare folder of this program; None: there is none."""
 
     folder: Path | None = None
+    has_failed = False
+    """True once it was logged that a kernel could not be kept."""
 
 
 def keep_kernels(spare: Path | None) -> None:
@@ -127,7 +129,7 @@ def _sources(package: str) -> list[Path]:
     return sorted(path for folder in folders for path in Path(folder).rglob("*_kernels.py"))
 
 
-class KernelCache(_Cache):
+class KernelCache:
     """Cache of one kernel, instead of Numba's; folders are looked for when it is first called, not when it is made."""
 
     def __init__(self, py_func: FunctionType) -> None:
@@ -283,9 +285,6 @@ def _errors_logged() -> Iterator[None]:
     try:
         yield
     except Exception as exc:  # noqa: BLE001 - a full disk, or a damaged index
-        _log_once(f"compiled kernels are not kept, and each process compiles its own: {exc}")
-
-
-@cache
-def _log_once(text: str) -> None:
-    log.warning("%s", text)
+        if not _Spare.has_failed:
+            _Spare.has_failed = True
+            log.warning("compiled kernels are not kept, and each process compiles its own: %s", exc)

@@ -61,8 +61,7 @@ class WarmStart:
         return f"compiling: {self._progress()}" if self._is_needed else None
 
     def _progress(self) -> str:
-        done = min(sum(map(is_compiled, known_kernels())), SERVER_KERNELS)
-        return f"{done} of {SERVER_KERNELS}, {time.monotonic() - self._start_s:.0f} s"
+        return f"{_count()} of {SERVER_KERNELS}, {time.monotonic() - self._start_s:.0f} s"
 
     def _compile(self) -> None:
         assert self._compilers is not None  # noqa: S101 - the thread is started after it was made
@@ -75,10 +74,17 @@ class WarmStart:
                         logged_s = time.monotonic()
                         log.info(text, self._progress(), extra=fields(kernel=name))
             drop_other_versions()
-            mark_warm(PACKAGE)
+            # Fewer, if the disk is full: then the next start tries again.
+            if _count() == SERVER_KERNELS:
+                mark_warm(PACKAGE)
             log.info("kernels are compiled", extra=fields(seconds=round(time.monotonic() - self._start_s, 1)))
         except CompilersError as exc:
             if not self._is_closing:
                 log.error("kernels are compiled when they are needed, for compiling them in advance failed: %s", exc)
         finally:
             self._is_needed = False
+
+
+def _count() -> int:
+    """Kernels of a server that are kept; a robot may have added others."""
+    return min(sum(map(is_compiled, known_kernels())), SERVER_KERNELS)

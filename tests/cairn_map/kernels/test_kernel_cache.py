@@ -40,9 +40,9 @@ def folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[P
     first, spare = tmp_path / "first", tmp_path / "spare"
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(first))
     monkeypatch.setattr(kernel_cache._Spare, "folder", spare)
+    monkeypatch.setattr(kernel_cache._Spare, "has_failed", False)
     yield first, spare
     kernel_cache._may_write.cache_clear()
-    kernel_cache._log_once.cache_clear()
 
 
 @pytest.fixture
