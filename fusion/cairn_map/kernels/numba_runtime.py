@@ -93,8 +93,9 @@ def known_kernels() -> "Iterator[Dispatcher]":
     """Every kernel of a `*_kernels` module that was imported and that Numba keeps on disk, once."""
     from numba.core.dispatcher import Dispatcher
 
-    names = [name for name in sys.modules if name.startswith("cairn_") and name.endswith("_kernels")]
-    values = {id(value): value for name in names for value in vars(sys.modules[name]).values()}
+    # Copies: other threads may import modules meanwhile.
+    names = [name for name in list(sys.modules) if name.startswith("cairn_") and name.endswith("_kernels")]
+    values = {id(value): value for name in names for value in list(vars(sys.modules[name]).values())}
     for value in values.values():
         if isinstance(value, Dispatcher) and value.stats.cache_path is not None:
             yield value

@@ -66,8 +66,8 @@ class WarmStart:
     def _compile(self) -> None:
         assert self._compilers is not None  # noqa: S101 - the thread is started after it was made
         text, logged_s = "compiling kernels, once for this version: %s", self._start_s
-        log.info(text, self._progress())
         try:
+            log.info(text, self._progress())
             with self._compilers as compilers:
                 for name in compilers.kernels():
                     if time.monotonic() >= logged_s + LOG_EVERY_S:
