@@ -270,6 +270,10 @@ def test_commands_of_the_page_for_administrators_run(page: Page, monkeypatch: py
         info = cairn(*page.here(["map", "info", "http://base:8750/maps/lab", "--json"]), folder=folder)
         return str(json.loads(info)["server_key"])
 
+    def send_backup() -> None:
+        command = [sys.executable, "-m", "cairn_client.main", "serve", "backup", "--data", "DIR", "-"]
+        subprocess.run(command, cwd=folder, stdout=subprocess.PIPE, check=True, timeout=60)
+
     upstream = (
         "serve --data DIR --upstream http://base:8750 --upstream-token-file field1.secret --trust-server BASE_KEY"
     )
@@ -279,6 +283,7 @@ def test_commands_of_the_page_for_administrators_run(page: Page, monkeypatch: py
             "serve --data DIR --settings server.toml": lambda: page.serve(
                 "HOST", "--data", "DIR", "--settings", "server.toml"
             ),
+            "serve backup --data DIR -": send_backup,
             "serve --data NEW": serve_restored,
             "token create http://base:8750 field1 --role relay": create_relay,
             upstream: serve_field,

@@ -4,15 +4,21 @@ Counters and histograms live in a registry of the service's own; what the store,
 looked up when the page is asked for. The page is the text format 0.0.4.
 """
 
-import os
 import threading
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
 from typing import Generic, TypeVar
 
-from prometheus_client import CONTENT_TYPE_PLAIN_0_0_4, CollectorRegistry, Counter, Histogram, Metric, generate_latest
+from prometheus_client import (
+    CONTENT_TYPE_PLAIN_0_0_4,
+    CollectorRegistry,
+    Counter,
+    Histogram,
+    Metric,
+    ProcessCollector,
+    generate_latest,
+)
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 from prometheus_client.metrics import MetricWrapperBase
 from prometheus_client.registry import Collector
@@ -76,6 +82,19 @@ class ServerFigures:
             "outcome",
         )
         self.push_bytes = self._counter("cairn_push_bytes_total", "Bytes of commits that were new.", "map")
+        self.robot_commits = self._counter(
+            "cairn_robot_commits_total", "Commits of a robot that were new.", "map", "robot"
+        )
+        self.robot_bytes = self._counter(
+            "cairn_robot_commit_bytes_total", "Bytes of commits of a robot that were new.", "map", "robot"
+        )
+        self.robot_refusals = self._counter(
+            "cairn_robot_refusals_total",
+            "Requests of a robot that were refused, without those that only read, by the kind of the problem.",
+            "map",
+            "robot",
+            "kind",
+        )
         self.frames = self._counter("cairn_fetch_frames_total", "Cell frames made for fetches, by kind.", "kind")
         self.frame_bytes = self._counter("cairn_fetch_frame_bytes_total", "Bytes of cell frames, by kind.", "kind")
         self.fold_seconds = self._histogram(
@@ -217,6 +236,11 @@ def share_metrics(used: Iterable[UsedPart]) -> Iterator[Metric]:
     yield gauge
 
 
+def ready_metrics(is_ready: bool) -> Iterator[Metric]:
+    """Answer of `/readyz`, for those who ask for figures alone."""
+    yield GaugeMetricFamily("cairn_ready", "1 if a push would be taken and brought into the map, else 0.", is_ready)
+
+
 def memory_metrics(limit_bytes: int) -> Iterator[Metric]:
     """Memory of all processes of the server, and its limit."""
     yield GaugeMetricFamily("cairn_memory_limit_bytes", "Memory that all processes may take together.", limit_bytes)
@@ -235,6 +259,10 @@ RELEASED_S = 1_795_478_400.0
 with each release; never ahead of it."""
 
 
+PROCESS = ProcessCollector(registry=None)
+"""The library's own figures of this process, read from /proc; none where that is missing."""
+
+
 def program_version() -> str:
     """Version of cairn, `unknown` where it runs from its sources."""
     try:
@@ -244,16 +272,8 @@ def program_version() -> str:
 
 
 def process_metrics() -> Iterator[Metric]:
-    """Version, processor time, memory and open files of this process, under the names that all exporters use."""
+    """Version, and the processor time, memory, start and open files of this process, as all exporters name them."""
     build = GaugeMetricFamily("cairn_build_info", "Always 1; the version is the label.", labels=["version"])
     build.add_metric([program_version()], 1)
     yield build
-    times = os.times()
-    yield CounterMetricFamily("process_cpu_seconds_total", "Processor time used.", round(times.user + times.system, 2))
-    statm, descriptors = Path("/proc/self/statm"), Path("/proc/self/fd")
-    if statm.exists():
-        pages = int(statm.read_text().split()[1])
-        resident_bytes = pages * os.sysconf("SC_PAGE_SIZE")
-        yield GaugeMetricFamily("process_resident_memory_bytes", "Memory in use.", resident_bytes)
-        count = sum(1 for _ in descriptors.iterdir())
-        yield GaugeMetricFamily("process_open_fds", "Open files and sockets.", count)
+    yield from PROCESS.collect()

@@ -16,10 +16,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import chain
 
+from cairn_map.errors import UnreachableError
 from cairn_server.access.auth import TokenHolders
 from cairn_server.access.cancellation import StopTime
 from cairn_server.access.rate_limits import ActLimit
 from cairn_server.access.server_certificate import certificate_of
+from cairn_server.access.wrong_tokens import WrongTokens
 from cairn_server.cell_room import DECODING
 from cairn_server.folding.cells import Cells
 from cairn_server.folding.damaged_cells import DamagedCells
@@ -40,6 +42,7 @@ from cairn_server.metrics import (
     memory_metrics,
     metrics_text,
     process_metrics,
+    ready_metrics,
     robot_metrics,
     safekeeping_metrics,
     share_metrics,
@@ -61,6 +64,7 @@ from cairn_server.sync.retracting import Retracts
 from cairn_server.sync.uploads import Uploads
 from cairn_server.views.cell_views import CellViews
 from cairn_server.views.export_tickets import ExportTickets
+from cairn_server.views.hottest_search import HottestSearch
 from cairn_server.views.map_changes import MapChangesSearch
 from cairn_server.views.map_exports import MapExports
 from cairn_server.views.map_views import MapViews
@@ -93,6 +97,7 @@ class ViewParts:
     exports: MapExports
     tickets: ExportTickets
     changes: MapChangesSearch
+    hottest: HottestSearch
 
 
 class Service:
@@ -120,6 +125,7 @@ class Service:
         self.stop_time = StopTime()
         shared_uses = store.replicas.uses if store.replicas is not None else None
         self.acts = ActLimit(settings.quotas.acts_per_hour, shared=shared_uses)
+        self.wrong_tokens = WrongTokens(store)
         self.live = Hub(store, connections=settings.limit_concurrency)
         self.reports = RobotReports(store, self.live)
         self.fold_news = FoldNews()
@@ -197,6 +203,7 @@ class Service:
             exports,
             ExportTickets(self.store, self.holders, exports),
             MapChangesSearch(self.store, self.cells),
+            HottestSearch(self.store, self.cells),
         )
 
     def _folded(self, row: MapRow) -> None:
@@ -238,7 +245,17 @@ class Service:
         memory = memory_metrics(self.settings.memory.limit_bytes)
         clock = clock_metrics(self.clock.doubt_s())
         counted = self.figures.registry.collect()
-        return metrics_text(chain(counted, store, shares, upstream, robots, kept, memory, clock, process_metrics()))
+        ready = ready_metrics(self._is_ready())
+        return metrics_text(
+            chain(counted, ready, store, shares, upstream, robots, kept, memory, clock, process_metrics())
+        )
+
+    def _is_ready(self) -> bool:
+        try:
+            self.readiness.check()
+        except UnreachableError:
+            return False
+        return True
 
     def stop_streams(self) -> None:
         """Count as not ready and end live streams, which never end alone; requests are still answered for a while."""

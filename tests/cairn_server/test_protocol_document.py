@@ -19,11 +19,10 @@ from cairn_server.live import hub as live
 from cairn_server.live import robot_reports
 from cairn_server.memory_shares import CHECK_MAX_BYTES
 from cairn_server.settings import Quotas, Settings
-from cairn_server.store import numbering, shares
-from cairn_server.store.sqlite import tokens as sqlite_tokens
+from cairn_server.store import numbering, shares, store_rows
 from cairn_server.sync import cell_changes, missing, uploads
 from cairn_server.sync.checks import check_pool, commit_checks
-from cairn_server.views import export_tickets, map_changes, map_exports, map_views, readings
+from cairn_server.views import export_tickets, hottest_search, map_changes, map_exports, map_views, readings
 
 KIND = re.compile(r"[a-z]+(_[a-z]+)*")
 RAISERS = ("_problem", "send_problem", "__init__")
@@ -92,6 +91,11 @@ def test_the_statuses_in_the_document_are_those_of_the_code(kind: str) -> None:
         ("counting an export's points", map_exports.COUNT_S),
         ("exports counted at once", map_exports.COUNTS_AT_ONCE),
         ("voxels in an answer about changes", map_changes.CHANGED_MAX),
+        (
+            "memory for the cells of a search for the hottest voxels",
+            hottest_search.CELLS_BYTES,
+        ),
+        ("looking for the hottest voxels", hottest_search.SEARCH_S),
         ("searches for changes at once", map_changes.SEARCHES_AT_ONCE),
         ("commits of a cell without epochs that are added up for its past", readings.PAST_ENTRIES_MAX),
         ("tickets for exports of one token", export_tickets.TICKETS_OF_TOKEN_MAX),
@@ -114,7 +118,7 @@ def test_the_statuses_in_the_document_are_those_of_the_code(kind: str) -> None:
         ("`intervals` of the numbers of all its incarnations", shares.INTERVALS_OF_ROBOT_MAX),
         ("`sums`: per region of 4^3 cells, hits and misses", shares.limits_of("mole", 3)[0]),
         ("`sums`: per region of 4^3 cells, every other plane", shares.limits_of("mole", 3)[2]),
-        ("audit log", sqlite_tokens.AUDIT_ROWS_MAX),
+        ("audit log", store_rows.AUDIT_ROWS_MAX),
     ],
 )
 def test_the_limits_in_the_document_are_those_of_the_code(row: str, number: float) -> None:

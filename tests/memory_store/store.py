@@ -226,11 +226,11 @@ class MemoryStore:
     def keep_age(self) -> None:
         """Keep nothing: the store ends with the process."""
 
-    def audit(self, what: str, detail: str) -> None:
+    def audit(self, what: str, detail: str, *, client: str = "") -> None:
         """Note something that an administrator may have to look into."""
         log.warning("%s: %r", what, detail)
         with suppress(UnreachableError):
-            self.audit_log.add("server", what, detail)
+            self.audit_log.add("server", what, detail, client=client)
 
     def close(self) -> None:
         """Answer nothing any more."""

@@ -9,13 +9,19 @@ from dataclasses import replace
 from tests.memory_store.maps import MemoryMaps
 
 from cairn_map.errors import ConflictError, NotFoundError, UnreachableError
-from cairn_map.wire.access_messages import AuditEntry, audit_chain
+from cairn_map.wire.access_messages import AuditEntry, AuditText, audit_chain
 from cairn_server.store.store_age import StoreAge
-from cairn_server.store.store_rows import MapRow, Token, registration_name
+from cairn_server.store.store_rows import (
+    ALL_LINES,
+    AUDIT_ROWS_MAX,
+    AuditChoice,
+    MapRow,
+    Token,
+    audit_entry,
+    registration_name,
+)
 
 log = logging.getLogger(__name__)
-
-AUDIT_LINES_MAX = 100_000
 
 
 class MemoryTokens:
@@ -116,20 +122,21 @@ class MemoryAuditLog:
 
     def __init__(self, maps: MemoryMaps) -> None:
         self._maps = maps
-        self._lines: deque[AuditEntry] = deque(maxlen=AUDIT_LINES_MAX)
+        self._lines: deque[AuditEntry] = deque(maxlen=AUDIT_ROWS_MAX)
 
-    def add(self, who: str, what: str, detail: str) -> None:
+    def add(self, who: str, what: str, detail: str, *, client: str = "") -> None:
         """One more line, chained to the last; the newest are kept."""
         log.info("%s: %s: %r", who, what, detail)
         with self._maps.locked():
             number, before = (self._lines[-1].number, self._lines[-1].chain) if self._lines else (0, "")
             number, time_s = number + 1, time.time()
-            chain = audit_chain(bytes.fromhex(before), number, time_s, who=who, what=what, detail=detail)
-            self._lines.append(
-                AuditEntry(number=number, time_s=time_s, who=who, what=what, detail=detail, chain=chain.hex())
-            )
+            chain = audit_chain(bytes.fromhex(before), number, time_s, AuditText(who, what, detail, client))
+            self._lines.append(audit_entry((number, time_s, who, what, detail, chain, client)))
 
-    def page(self, *, after: int, limit: int) -> list[AuditEntry]:
-        """Lines numbered above `after`, oldest first."""
+    def page(
+        self, *, limit: int, after: int = 0, before: int | None = None, choice: AuditChoice = ALL_LINES
+    ) -> list[AuditEntry]:
+        """Lines of a choice, oldest first, or with `before` newest first."""
         with self._maps.locked():
-            return [line for line in self._lines if line.number > after][:limit]
+            found = [line for line in self._lines if line.number > after and choice.fits(line)]
+        return found[:limit] if before is None else [line for line in reversed(found) if line.number < before][:limit]

@@ -26,6 +26,9 @@ NEGATIVE = re.compile(r"-\d[-\d.]*[,:][-\d.,:]*|-[xyz]")
 SECONDS = re.compile(r"\d{9,11}(\.\d+)?")
 """Seconds since 1970, after 1973."""
 
+AGE = re.compile(r"(\d{1,6}(?:\.\d+)?)([smhd])")
+UNITS_S = {"s": 1, "m": 60, "h": 3600, "d": 86_400}
+
 Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 Run: TypeAlias = Callable[[argparse.Namespace], int]
 AddParser: TypeAlias = Callable[[Subparsers], None]
@@ -154,6 +157,20 @@ def shown_age(seconds: float) -> str:
         if seconds < limit:
             return f"{max(0.0, seconds) / size:.0f} {unit}"
     return f"{seconds / 86_400:.0f} d"
+
+
+def instant_of(text: str, *, now: datetime | None = None) -> float:
+    """UTC seconds since 1970 of an age (`30m`, `2h`, `7d` ago), or of a time as `seconds_of` reads it.
+
+    Raises:
+        BadInputError: kind `bad_time`.
+    """
+    age = AGE.fullmatch(text)
+    if age is None:
+        time_s = seconds_of(text, now=now)
+        assert time_s is not None  # noqa: S101 - of a text it is never None
+        return time_s
+    return (now or datetime.now(UTC)).timestamp() - float(age[1]) * UNITS_S[age[2]]
 
 
 def seconds_of(text: str | None, *, now: datetime | None = None) -> float | None:

@@ -27,6 +27,7 @@ from cairn_client.http.api import MapApi
 from cairn_map.commits.ids import robot_name
 from cairn_map.errors import BadInputError, first_error
 from cairn_map.wire.access_messages import CreateToken, RoleText, TokenInfo
+from cairn_map.wire.utc_times import with_utc
 
 DAY_S = 86_400.0
 
@@ -97,7 +98,7 @@ def _list(args: argparse.Namespace) -> int:
     with MapApi(args.server, token=args.token.of(args.server)) as api:
         infos = api.tokens()
     if args.json:
-        say(json.dumps([info.model_dump(mode="json") for info in infos]))
+        say(json.dumps([with_utc(info).model_dump(mode="json") for info in infos]))
         return 0
     say(f"{'token':<24} {'role':<8} {'counts on':<22} {'until':<17} last used")
     for info in infos:

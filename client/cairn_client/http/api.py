@@ -40,6 +40,7 @@ from cairn_map.evidence.fingerprint import fingerprint_from_hex
 from cairn_map.evidence.grid import Cell
 from cairn_map.machine_clocks import MACHINE_CLOCKS
 from cairn_map.wire.access_messages import (
+    AuditEntry,
     Challenge,
     CreateToken,
     NewSecret,
@@ -51,6 +52,7 @@ from cairn_map.wire.access_messages import (
 )
 from cairn_map.wire.change_messages import ChangesAnswer
 from cairn_map.wire.frames import FRAME_BYTES_MAX, JSON_BYTES_MAX, Frame
+from cairn_map.wire.hottest_messages import HottestAnswer
 from cairn_map.wire.messages import (
     INDEX_PAGE,
     BranchInfo,
@@ -342,6 +344,10 @@ class MapApi:
         """All tokens, without their secrets."""
         return list_of(TokenInfo, self._ask("GET", "/tokens"))
 
+    def audit(self, **choice: str | int) -> list[AuditEntry]:
+        """Lines of the audit log, newest first: those that fit a choice (`map`, `since`, `who`, ... of PROTOCOL.md)."""
+        return list_of(AuditEntry, self._ask("GET", "/audit", params={"newest": "true", **choice}))
+
     def log(self, name: str, *, after: int = 0, limit: int = 100) -> list[LogEntry]:
         """Log entries after a sequence number, oldest first."""
         return list_of(LogEntry, self._ask("GET", f"/maps/{name}/log", params={"after": after, "limit": limit}))
@@ -376,6 +382,11 @@ class MapApi:
         asked = {"since": since_s, "until": until_s, "box": ",".join(map(str, box_m)) if box_m else None}
         params = {key: str(value) for key, value in asked.items() if value is not None}
         return message_from_json(ChangesAnswer, self._ask("GET", f"/maps/{name}/main/changes", params=params))
+
+    def hottest(self, name: str, *, count: int, box_m: Sequence[float] | None = None) -> HottestAnswer:
+        """The occupied voxels of the highest temperature; a box is x0, y0, z0, x1, y1, z1 in metres."""
+        params = {"count": str(count)} | ({"box": ",".join(map(str, box_m))} if box_m else {})
+        return message_from_json(HottestAnswer, self._ask("GET", f"/maps/{name}/main/hottest", params=params))
 
     def vector_at(self, name: str, cursor: str) -> VersionVector:
         """The ids that a server had folded at a cursor."""

@@ -135,6 +135,13 @@ def voxels_in_box(frozen: FrozenMap, box_m: Box | None, *, occupied_only: bool) 
 
 def hottest(frozen: FrozenMap, n: int, *, min_probability: float, box_m: Box | None) -> Voxels:
     """The n known voxels of the highest mean temperature: first those that are confirmed, each group hottest first."""
+    return ranked_hottest(frozen, n, min_probability=min_probability, box_m=box_m)[0]
+
+
+def ranked_hottest(
+    frozen: FrozenMap, n: int, *, min_probability: float, box_m: Box | None, only: CellKey | None = None
+) -> tuple[Voxels, npt.NDArray[np.bool_]]:
+    """`hottest`, of one cell where it is named, and (N,) True for those that are confirmed."""
     if n < 0 or not 0 <= min_probability <= 1:
         raise BadInputError("bad_range", f"n must be 0 or more, a probability 0 to 1; got {n}, {min_probability}")
     channel = first_of_kind(frozen.geometry, ChannelKind.TEMPERATURE)
@@ -142,6 +149,8 @@ def hottest(frozen: FrozenMap, n: int, *, min_probability: float, box_m: Box | N
     low, high = frozen.voxels_of_box(box_m)
     parts, confirmed = [], [np.empty(0, np.bool_)]
     for key, cell in zip(frozen.keys, frozen.cells, strict=True):
+        if only not in (None, key):
+            continue
         # Rows of samples that are asked for, hottest first.
         evidence = cell.packed()
         sums, counts = evidence.samples[:, planes], evidence.counts[evidence.sampled]
@@ -158,8 +167,9 @@ def hottest(frozen: FrozenMap, n: int, *, min_probability: float, box_m: Box | N
         parts.append(_voxels(frozen, key, evidence.where(chosen), occupied_only=False))
         confirmed.append(is_sure[chosen])
     voxels = joined_voxels(parts or [_voxels(frozen, CellKey(0), empty_evidence(frozen.geometry), occupied_only=False)])
-    kelvin = voxels.readings[channel.name].mean
-    return voxels.rows(np.lexsort((-kelvin, ~np.concatenate(confirmed)))[:n])
+    kelvin, are_sure = voxels.readings[channel.name].mean, np.concatenate(confirmed)
+    first = np.lexsort((-kelvin, ~are_sure))[:n]
+    return voxels.rows(first), are_sure[first]
 
 
 def _first_confirmed(frozen: FrozenMap, numbers: Ints, hits: Values, n: int) -> tuple[Ints, Ints]:

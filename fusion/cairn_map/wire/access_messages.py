@@ -2,11 +2,13 @@
 
 import hashlib
 import json
+from dataclasses import dataclass
 from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from cairn_map.wire.messages import NameText
+from cairn_map.wire.utc_times import UtcText
 
 RoleText = Literal["admin", "operator", "robot", "reader", "enroller", "relay"]
 LIFETIME_MAX_S = 20 * 366 * 86_400.0
@@ -53,6 +55,9 @@ class TokenInfo(_Model):
     """Time of its last use, UTC seconds since 1970; updated every few seconds at most."""
     confirmed: bool = True
     """False after a restore, until an admin confirms that the token still counts."""
+    created_utc: UtcText = None
+    expires_utc: UtcText = None
+    last_used_utc: UtcText = None
 
 
 class ServerInfo(_Model):
@@ -135,6 +140,7 @@ class KeyInfo(_Model):
     """Name of the token that brought it."""
     may_return: bool
     """True from an operator's word until the robot has registered by it."""
+    since_utc: UtcText = None
 
 
 class AskingRobot(_Model):
@@ -147,6 +153,8 @@ class AskingRobot(_Model):
     """Time of its last try, UTC seconds since 1970."""
     by: str
     """Name of the token that it showed, or of the relay that brought its commit."""
+    since_utc: UtcText = None
+    asked_utc: UtcText = None
 
 
 class RobotKeyList(_Model):
@@ -175,16 +183,31 @@ class AuditEntry(_Model):
     detail: str
     chain: str
     """SHA-256 over the line before and this one, in hex; empty for lines older than the chain."""
+    client: Annotated[str, Field(exclude_if=lambda value: not value)] = ""
+    """Address that the request came from; empty, and left out, where there was none, and in older lines."""
+    time_utc: UtcText = None
 
     def is_next_after(self, before: "AuditEntry") -> bool:
         """True if this line follows the line `before` in the chain, and is unchanged."""
-        chain = audit_chain(
-            bytes.fromhex(before.chain), self.number, self.time_s, who=self.who, what=self.what, detail=self.detail
-        )
-        return chain.hex() == self.chain
+        said = AuditText(self.who, self.what, self.detail, self.client)
+        return audit_chain(bytes.fromhex(before.chain), self.number, self.time_s, said).hex() == self.chain
 
 
-def audit_chain(before: bytes, number: int, time_s: float, *, who: str, what: str, detail: str) -> bytes:
-    """The chain at a line of the audit log, from the chain at the line before (empty at the first)."""
-    line = json.dumps([number, time_s, who, what, detail], separators=(",", ":"))
+@dataclass(frozen=True, slots=True)
+class AuditText:
+    """Texts of a line of the audit log."""
+
+    who: str
+    what: str
+    detail: str
+    client: str = ""
+
+
+def audit_chain(before: bytes, number: int, time_s: float, said: AuditText) -> bytes:
+    """The chain at a line of the audit log, from the chain at the line before (empty at the first).
+
+    Lines without an address are hashed as those of before there were addresses.
+    """
+    parts = [number, time_s, said.who, said.what, said.detail, *([said.client] if said.client else [])]
+    line = json.dumps(parts, separators=(",", ":"))
     return hashlib.sha256(before + line.encode()).digest()

@@ -17,6 +17,7 @@ from cairn_map.errors import DamagedDataError, first_error
 from cairn_map.evidence.fingerprint import Fingerprint, fingerprint_from_hex
 from cairn_map.evidence.grid import Geometry, cell_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
+from cairn_map.wire.utc_times import UtcText, UtcTexts
 
 INDEX_PAGE = 1000
 """Entries of a page of which the asker says nothing."""
@@ -166,6 +167,7 @@ class BranchInfo(_Model):
     incarnation: str = ""
     """Incarnation of its latest registration."""
     last_seen_s: float
+    last_seen_utc: UtcText = None
     status: RobotStatus | None = None
     """Its latest status."""
     view_s: float | None = None
@@ -352,6 +354,7 @@ class LogEntry(_Model):
     size_bytes: Count
     cells: Count
     captured_s: tuple[float, float] | None
+    captured_utc: UtcTexts = None
     retracts: Annotated[list[IdText], FailFast()]
     parent: ShaText | None = None
     seen: CursorText | None = None

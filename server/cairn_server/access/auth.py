@@ -52,6 +52,8 @@ class Caller:
     """Number of the one map that the token counts on; None: all maps."""
     is_returning: bool = False
     """True if there is no token, but a robot's key that an operator lets in."""
+    address: str = ""
+    """Address that the request came from, for the audit log."""
 
     def may_author(self, robot: str) -> bool:
         """True if this caller may push commits of this robot."""

@@ -34,7 +34,7 @@ def create_token(store: Store, name: str, request: CreateToken, *, by: Caller) -
     )
     secret = new_token()
     store.tokens.add(token, token_hash(secret))
-    store.audit_log.add(by.name, "create_token", f"{name}: {request.model_dump_json(exclude_none=True)}")
+    store.audit_log.add(by.name, "create_token", _detail(token, request), client=by.address)
     return NewSecret(token=secret, info=_info(token))
 
 
@@ -46,7 +46,7 @@ def rotate_token(store: Store, name: str, *, by: Caller) -> NewSecret:
     """
     secret = new_token()
     token = store.tokens.renew(name, token_hash(secret))
-    store.audit_log.add(by.name, "rotate_token", name)
+    store.audit_log.add(by.name, "rotate_token", _detail(token), client=by.address)
     return NewSecret(token=secret, info=_info(token))
 
 
@@ -57,7 +57,7 @@ def revoke_token(store: Store, name: str, *, by: Caller) -> None:
         NotFoundError: kind `no_such_token`.
     """
     store.tokens.remove(name)
-    store.audit_log.add(by.name, "revoke_token", name)
+    store.audit_log.add(by.name, "revoke_token", name, client=by.address)
 
 
 def confirm_token(store: Store, name: str, *, by: Caller) -> TokenInfo:
@@ -67,13 +67,19 @@ def confirm_token(store: Store, name: str, *, by: Caller) -> TokenInfo:
         NotFoundError: kind `no_such_token`.
     """
     token = store.tokens.confirm(name)
-    store.audit_log.add(by.name, "confirm_token", name)
+    store.audit_log.add(by.name, "confirm_token", _detail(token), client=by.address)
     return _info(token)
 
 
 def list_tokens(store: Store) -> list[TokenInfo]:
     """All tokens, by name, without their secrets."""
     return [_info(token) for token in store.tokens.all()]
+
+
+def _detail(token: Token, request: CreateToken | None = None) -> str:
+    """Detail of a line of the audit log: of a token of one map it begins with the map's name, as all about a map do."""
+    of_map = f"map {token.map_name}: " if token.map_name else ""
+    return of_map + token.name + (f": {request.model_dump_json(exclude_none=True)}" if request else "")
 
 
 def _info(token: Token) -> TokenInfo:

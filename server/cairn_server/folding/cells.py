@@ -76,14 +76,14 @@ class Cells:
         """Cells of a map known to be damaged."""
         return self._damaged.of(row.name)
 
-    def heal(self, row: MapRow, key: CellKey, data: bytes, *, by: str) -> bool:
+    def heal(self, row: MapRow, key: CellKey, data: bytes, *, by: str, client: str = "") -> bool:
         """Replace a damaged cell by bytes that a client still has; False if the cell is sound.
 
         Raises:
             CairnError: as `damaged_cells.heal_cell`.
         """
         with self._healing:
-            is_healed = heal_cell(self._store, row, key, data, by=by)
+            is_healed = heal_cell(self._store, row, key, data, by=by, client=client)
         self._damaged.forget(row.name, key)
         self._on_heal()
         return is_healed

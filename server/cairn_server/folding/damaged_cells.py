@@ -76,7 +76,7 @@ def keep_healed(store: Store, row: MapRow, cells: Iterable[CellRow]) -> None:
             log.error("cell %s was rebuilt, but cannot be written: %s", cell_of_key(cell.key), exc.message)
 
 
-def heal_cell(store: Store, row: MapRow, key: CellKey, data: bytes, *, by: str) -> bool:
+def heal_cell(store: Store, row: MapRow, key: CellKey, data: bytes, *, by: str, client: str = "") -> bool:
     """Replace a damaged cell by these bytes; False if the cell is sound and nothing is written.
 
     Raises:
@@ -107,7 +107,8 @@ def heal_cell(store: Store, row: MapRow, key: CellKey, data: bytes, *, by: str) 
     sound = with_bytes(stored, written)
     if not store.health.heal(row, sound):
         return False
-    store.audit_log.add(by, "healed_cell", f"map {row.name}: {cell_of_key(key)} from {len(data)} bytes that were sent")
+    detail = f"map {row.name}: {cell_of_key(key)} from {len(data)} bytes that were sent"
+    store.audit_log.add(by, "healed_cell", detail, client=client)
     return True
 
 

@@ -1,27 +1,35 @@
 """Backups of a server's store: the commands `cairn serve backup` and `cairn serve restore`."""
 
 import argparse
+import logging
 import sys
+import time
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
-from cairn_map.errors import EXIT_CODES, DamagedDataError
+from cairn_map.errors import EXIT_CODES, BadInputError, DamagedDataError
 from cairn_map.progress import PercentLine
+from cairn_server.http.middleware.log_format import LogForm, add_log_format, fields, start_logging
 from cairn_server.operations.check import check_all
 from cairn_server.settings import Settings
 from cairn_server.store.sqlite.archive import SqliteArchive
-from cairn_server.store.sqlite.backup import Restored, back_up, restore
+from cairn_server.store.sqlite.backup import Restored, back_up, restore, send_backup
+
+log = logging.getLogger(__name__)
 
 BACKUP = """Copy a server's store into one file, while the server runs.
 
     $ cairn serve backup --data ./cairn-data nightly.cairn
     nightly.cairn: 41.3 MB, the state of ./cairn-data
 
+    $ cairn serve backup --data ./cairn-data - | ssh vault 'cat > nightly.cairn'
+
 The file holds one state of all maps. It takes its name only when all of it is on the disk, so that an older backup of
-that name is there until the new one is whole. Run it as the user that the server runs as. What is pushed after it
-is not in it: `cairn serve --stable-after` must be longer than the age of the oldest backup that you may restore
-(docs/administrator.md).
+that name is there until the new one is whole. `-` is standard output, for a pipe: the folder needs room for a copy of
+the store meanwhile, and only exit code 0 says that all of it was sent. Run it as the user that the server runs as.
+What is pushed after it is not in it: `cairn serve --stable-after` must be longer than the age of the oldest backup that
+you may restore (docs/administrator.md).
 """
 RESTORE = """Make a server's folder out of a backup.
 
@@ -54,12 +62,29 @@ def back_up_command(argv: list[str]) -> int:
         "cairn serve backup", description=BACKUP, epilog=EXIT_CODES, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("--data", type=Path, default=Settings().folder, metavar="DIR", help="folder of the store")
-    parser.add_argument("file", type=Path, metavar="FILE", help="the backup; an older one of that name is replaced")
+    parser.add_argument(
+        "file", metavar="FILE", help="the backup; an older one of that name is replaced; -: standard output"
+    )
+    add_log_format(parser)
     args = parser.parse_args(argv)
-    progress = PercentLine("backup")
-    size_bytes = back_up(args.data, args.file, progress.at)
+    is_piped = args.file == "-"
+    if is_piped and sys.stdout.isatty():
+        raise BadInputError("bad_backup", "a backup is no text: send standard output to a file or into a pipe")
+    is_json = args.log_format == LogForm.JSON
+    start_logging(LogForm(args.log_format), logging.INFO if is_json else logging.WARNING)
+    about = {"file": args.file, "data": str(args.data)}
+    log.info("backup begun", extra=fields(**about))
+    start_s, progress = time.monotonic(), PercentLine("backup")
+    if is_piped:
+        size_bytes = send_backup(args.data, sys.stdout.buffer, progress.at)
+    else:
+        size_bytes = back_up(args.data, Path(args.file), progress.at)
     progress.finish()
-    sys.stdout.write(f"{args.file}: {size_bytes / 1e6:.1f} MB, the state of {args.data}\n")
+    seconds = round(time.monotonic() - start_s, 3)
+    log.info("backup done", extra=fields(**about, size_bytes=size_bytes, seconds=seconds))
+    if not is_json:
+        place, stream = ("standard output", sys.stderr) if is_piped else (args.file, sys.stdout)
+        stream.write(f"{place}: {size_bytes / 1e6:.1f} MB, the state of {args.data}\n")
     return 0
 
 

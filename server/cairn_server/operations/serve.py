@@ -3,6 +3,7 @@
     $ cairn serve --data ./cairn-data
     cairn map server on http://127.0.0.1:8750, data in cairn-data
     memory: at most 6319 MB in all: caches 1258, checks 2 x 1610, folding 403, decoding 268, bodies 268, programs 537
+    cairn 0.1.0, settings: all defaults
 
 Robots push their measurements to it and fetch what they miss; stop it with Ctrl-C or SIGTERM. Everything
 that it acknowledged is in DIR/cairn.sqlite, so a crash or a power cut loses nothing.
@@ -66,6 +67,7 @@ from cairn_server.http.routes.long_bodies import LongBodies, fork_long_bodies
 from cairn_server.operations import check as check_command
 from cairn_server.operations.backup import back_up_command, restore_command
 from cairn_server.operations.bucket_owner import adopt_command
+from cairn_server.operations.life import Life
 from cairn_server.operations.reload import Reload
 from cairn_server.operations.serve_options import serve_parser, settings_of
 from cairn_server.operations.store_opening import opened, settling, store_of
@@ -129,7 +131,7 @@ def main(argv: list[str]) -> int:
         folding = fork_folding(reads_of, FoldMemory.of_server(settings.memory, settings.folder))
     long_bodies = fork_long_bodies()
     keep_memory_small()
-    with _folder_of(settings), listen(settings.host, settings.port) as listener:
+    with Life() as life, _folder_of(settings), listen(settings.host, settings.port) as listener:
         try:
             warm_start = WarmStart()
             service = Service(
@@ -137,9 +139,7 @@ def main(argv: list[str]) -> int:
             )
             with closing(service), _views_of(service), settling(service), joined(service) as relay, warm_start:
                 Reload(service, lambda: settings_of(args), relay).at_signal()
-                _serve(service, listener, long_bodies)
-        except KeyboardInterrupt:
-            pass
+                _serve(service, listener, long_bodies, life)
         finally:
             long_bodies.close()
     return 0
@@ -168,7 +168,7 @@ def _views_of(service: Service) -> AbstractContextManager[object]:
     return closing(ViewPrefetch(service.store, service.views.cells.cache, service.fold_news))
 
 
-def _serve(service: Service, listener: socket.socket, long_bodies: LongBodies) -> None:
+def _serve(service: Service, listener: socket.socket, long_bodies: LongBodies, life: Life) -> None:
     app = make_app(service, long_bodies=long_bodies)
     config = config_of(app, service.settings)
     host, port = listener.getsockname()[:2]
@@ -177,9 +177,7 @@ def _serve(service: Service, listener: socket.socket, long_bodies: LongBodies) -
     if scheme == "http" and host not in LOOPBACK:
         log.warning("tokens and maps travel in the clear: give --tls-cert and --tls-key, or put a TLS proxy before it")
     tell_port(service.settings.folder, port)
-    sys.stdout.write(f"cairn map server on {scheme}://{shown}:{port}, data in {service.settings.place}\n")
-    sys.stdout.write(f"{service.settings.memory.text()}\n")
-    sys.stdout.flush()
+    life.started(f"{scheme}://{shown}:{port}", service.settings)
     # A full sweep of the garbage collector takes 0.1 to 0.3 s, in which all wait. What is there by now stays, so none
     # looks at it; and what survived two sweeps of young objects is seldom a cycle.
     gc.freeze()
@@ -249,7 +247,7 @@ def config_of(app: FastAPI, settings: Settings, *, log_level: str = "warning") -
 
 def _stop(number: int, frame: FrameType | None) -> None:
     """End as Ctrl-C does, with everything closed: uvicorn raises the signal again once its answers are finished."""
-    raise KeyboardInterrupt
+    raise KeyboardInterrupt(signal.Signals(number).name)
 
 
 def listen(host: str, port: int) -> socket.socket:

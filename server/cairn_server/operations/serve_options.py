@@ -29,7 +29,8 @@ from pydantic_settings import (
 )
 
 from cairn_map.errors import EXIT_CODES, BadInputError, complaint_text
-from cairn_server.http.middleware.log_format import LogForm
+from cairn_server.http.middleware.log_format import add_log_format
+from cairn_server.metrics import program_version
 from cairn_server.settings import Settings
 from cairn_server.store.private_files import warn_if_open
 
@@ -92,6 +93,9 @@ def serve_parser(description: str | None) -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         argument_default=argparse.SUPPRESS,
     )
+    parser.add_argument(
+        "--version", action="version", version=f"cairn {program_version()}", help="print the version, and end"
+    )
     parser.add_argument("--settings", type=Path, metavar="FILE", help="TOML file of settings; see the end of this help")
     for name, (flag, metavar) in FLAGS.items():
         parser.add_argument(flag, dest=name, metavar=metavar, help=_help(Settings, name))
@@ -119,8 +123,7 @@ def serve_parser(description: str | None) -> argparse.ArgumentParser:
     ):
         parser.add_argument(flag, dest="folding", action="store_const", const=folding, help=text)
     parser.add_argument("--metrics-open", action="store_true", help=_help(Settings, "metrics_open"))
-    forms = [str(form) for form in LogForm]
-    parser.add_argument("--log-format", choices=forms, default=forms[0], help=f"form of log lines ({forms[0]})")
+    add_log_format(parser)
     parser.add_argument("-v", "--verbose", action="store_true", default=False, help="log every request and fold")
     for flag in MOVED:
         parser.add_argument(flag, action=_Moved, help=argparse.SUPPRESS)

@@ -110,7 +110,7 @@ class OwnMaps:
         request = CreateMap(geometry=upstream.geometry, sensor_model=upstream.sensor_model, epoch_s=upstream.epoch_s)
         _, is_new = self._service.maps.create(upstream.name, request)
         if is_new:
-            self._service.store.audit_log.add(UPSTREAM.name, "create_map", upstream.name)
+            self._service.store.audit_log.add(UPSTREAM.name, "create_map", f"map {upstream.name}: created")
         return OwnEnd(self._service, self._service.store.map(upstream.name))
 
     def _check_place(self) -> None:

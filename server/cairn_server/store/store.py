@@ -27,6 +27,8 @@ from cairn_server.store.replica_notes import ReplicaNotes
 from cairn_server.store.store_age import StoreAge
 from cairn_server.store.store_clock import StoreClock
 from cairn_server.store.store_rows import (
+    ALL_LINES,
+    AuditChoice,
     Backlog,
     Branch,
     CellRow,
@@ -332,12 +334,14 @@ class AdmittedKeys(Protocol):
 class AuditLog(Protocol):
     """Lines that are added and never changed, each with a hash over the one before; the newest are kept."""
 
-    def add(self, who: str, what: str, detail: str) -> None:
-        """Add a line; durable on return."""
+    def add(self, who: str, what: str, detail: str, *, client: str = "") -> None:
+        """Add a line, with the address that the request came from; durable on return."""
         ...
 
-    def page(self, *, after: int, limit: int) -> list[AuditEntry]:
-        """Lines numbered above `after`, oldest first."""
+    def page(
+        self, *, limit: int, after: int = 0, before: int | None = None, choice: AuditChoice = ALL_LINES
+    ) -> list[AuditEntry]:
+        """Lines of a choice numbered above `after`, oldest first; with `before` those below it, newest first."""
         ...
 
 
@@ -569,7 +573,7 @@ class Store(Protocol):
         """Keep the age of the store, for the next start; may be written later."""
         ...
 
-    def audit(self, what: str, detail: str) -> None:
+    def audit(self, what: str, detail: str, *, client: str = "") -> None:
         """Note something that an administrator may have to look into; may be written later."""
         ...
 

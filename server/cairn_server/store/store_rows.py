@@ -1,9 +1,9 @@
 """Rows of a store: maps, commits, cells, log entries, branches, tokens, and the sums over them."""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.ids import Author, CommitId
@@ -13,8 +13,13 @@ from cairn_map.epochs.layer import MapLayer
 from cairn_map.evidence.fingerprint import Fingerprint
 from cairn_map.evidence.grid import CellKey, Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
-from cairn_map.wire.access_messages import RoleText
+from cairn_map.wire.access_messages import AuditEntry, RoleText
 from cairn_server.store.admission import OWN_WORD, Grounds
+
+AUDIT_ROWS_MAX = 100_000
+"""Newest lines of the audit log, which are kept; a choice reads through all of them at most, some 30 ms."""
+NUMBER_LIMIT = 1 << 63
+"""Above every line's number."""
 
 Robot = tuple[int, str]
 """Number of the map, and the robot's name, or `relay_of` a token."""
@@ -377,3 +382,69 @@ class Token:
 def registration_name(map_name: str, robot: str) -> str:
     """Name of a registration's token; no administrator can choose it, because of its colon."""
     return f"{map_name}:{robot}"
+
+
+@dataclass(frozen=True, slots=True)
+class AuditChoice:
+    """Lines of the audit log that are asked for, in every store the same; None: whatever they say there.
+
+    A line about one map begins its detail with `map NAME:`; in stores of earlier versions that of its creation is the
+    name alone.
+    """
+
+    who: str | None = None
+    what: str | None = None
+    map: str | None = None
+    since_s: float | None = None
+    """Not before this time, UTC seconds since 1970."""
+    until_s: float | None = None
+    """Before this time, UTC seconds since 1970."""
+
+    def fits(self, line: AuditEntry) -> bool:
+        """True if a line is asked for."""
+        return (
+            self.who in (None, line.who)
+            and self.what in (None, line.what)
+            and (self.map is None or _is_about(line, self.map))
+            and (self.since_s is None or line.time_s >= self.since_s)
+            and (self.until_s is None or line.time_s < self.until_s)
+        )
+
+    def conditions(self, mark: str) -> tuple[list[str], list[str | float]]:
+        """Conditions on a row of the table `audit`, and the values of their marks (`?` or `%s`)."""
+        found: list[str] = []
+        values: list[str | float] = []
+        for text, value in (
+            ("who = ", self.who),
+            ("what = ", self.what),
+            ("time_s >= ", self.since_s),
+            ("time_s < ", self.until_s),
+        ):
+            if value is not None:
+                found.append(text + mark)
+                values.append(value)
+        if self.map is not None:
+            begin = _begin_of(self.map)
+            found.append(f"(substr(detail, 1, {len(begin)}) = {mark} OR what = 'create_map' AND detail = {mark})")
+            values += [begin, self.map]
+        return found, values
+
+
+AUDIT_COLUMNS = "number, time_s, who, what, detail, chain, client"
+"""Columns of which `audit_entry` makes a line."""
+ALL_LINES = AuditChoice()
+"""All lines of the audit log."""
+
+
+def audit_entry(row: Sequence[Any]) -> AuditEntry:
+    """Line of a row of `AUDIT_COLUMNS`."""
+    number, time_s, who, what, detail, chain, client = row
+    return AuditEntry(number=number, time_s=time_s, who=who, what=what, detail=detail, chain=chain.hex(), client=client)
+
+
+def _is_about(line: AuditEntry, name: str) -> bool:
+    return line.detail.startswith(_begin_of(name)) or (line.what, line.detail) == ("create_map", name)
+
+
+def _begin_of(name: str) -> str:
+    return f"map {name}:"

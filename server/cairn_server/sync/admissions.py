@@ -114,7 +114,7 @@ class Admissions:
         """
         check_robot_name(author.robot)
         self._store.keys.admit(row, author, by=by.name)
-        self._store.audit_log.add(by.name, "admit", f"map {row.name}: {author}")
+        self._store.audit_log.add(by.name, "admit", f"map {row.name}: {author}", client=by.address)
         with self._lock:
             self._asking[row.number].remove(author)
 

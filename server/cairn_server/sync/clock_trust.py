@@ -137,8 +137,8 @@ class ClockTrust:
                 # One epoch less: a commit may be of the epoch after that of its arrival.
                 self._newest_s = max(self._newest_s, begin_s(Epoch(epoch - 1), row.epoch_s))
 
-    def trust(self, *, by: str) -> float:
-        """Trust the time of day as it is, by an operator's word; returns that time.
+    def trust(self, *, by: str, client: str = "") -> float:
+        """Trust the time of day as it is, by an operator's word from this address; returns that time.
 
         Raises:
             ConflictError: kind `clock_behind`: it is before this program was made.
@@ -153,7 +153,7 @@ class ClockTrust:
             )
         with self._lock:
             self._end_doubt(found, excused_s=max(found.wall_s, self._newest_s))
-        self._store.audit_log.add(by, "trust_clock", f"the time of day is {_shown(found.wall_s)}")
+        self._store.audit_log.add(by, "trust_clock", f"the time of day is {_shown(found.wall_s)}", client=client)
         return found.wall_s
 
     def _note_map(self, row: MapRow) -> None:

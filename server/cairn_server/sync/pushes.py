@@ -132,7 +132,8 @@ class Pushes:
         """Add a line to the audit log for a refused push, within a bound for each token."""
         # A robot that meets a conflict tries again, so without a bound one token could push out the older lines.
         if self._audit_limit.is_worth_a_line(caller.name):
-            self._store.audit_log.add(caller.name, conflict.kind, f"map {row.name}: {conflict.message}")
+            detail = f"map {row.name}: {conflict.message}"
+            self._store.audit_log.add(caller.name, conflict.kind, detail, client=caller.address)
 
     def close(self) -> None:
         """End the workers that check."""

@@ -57,7 +57,7 @@ class Retracts:
             self._wanted.note(row.name, exc.commits, asker=OPERATOR)
             raise
         detail = f"map {row.name}: {ids[-1]} takes out {len(names)} commits: {request.note}"
-        self._store.audit_log.add(by.name, "retract", detail)
+        self._store.audit_log.add(by.name, "retract", detail, client=by.address)
         self._on_new()
         return Retracted(id=ids[-1], commits=names)
 

@@ -4,9 +4,11 @@ import json
 import logging
 import signal
 import socket
+import subprocess
 import sys
 from pathlib import Path
 
+import httpx
 import pytest
 from tests.fixtures.server.live import Live, Process
 from tests.fixtures.server.processes import client, make_map
@@ -97,6 +99,78 @@ def test_an_exception_is_told_in_either_form() -> None:
         record = logging.LogRecord("cairn", logging.ERROR, __file__, 1, "failed", (), sys.exc_info())
     assert "ValueError: why" in TextFormatter().format(record)
     assert "ValueError: why" in json.loads(JsonFormatter().format(record))["exception"]
+
+
+@pytest.mark.processes
+def test_every_line_is_json_from_the_first_to_the_last(tmp_path: Path) -> None:
+    (tmp_path / "admin").write_text(ADMIN)
+    options = ("--admin-token-file", str(tmp_path / "admin"), "--log-format", "json")
+    first = subprocess.Popen(
+        [sys.executable, "-m", "cairn_client.main", "serve", "--data", str(tmp_path / "data"), "--port", "0", *options],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    assert first.stdout is not None
+    started = json.loads(first.stdout.readline())
+    with httpx.Client(base_url=started["url"]) as http:
+        assert http.get("/maps", headers={"Authorization": f"Bearer {WRONG}"}).status_code == 401
+    with socket.create_connection(("127.0.0.1", int(started["url"].rpartition(":")[2])), timeout=60) as link:
+        link.sendall(b"junk\r\n\r\n")
+        assert b"400" in link.recv(64)
+    # A second one on the same folder, which does not start.
+    second = subprocess.run(
+        [sys.executable, "-m", "cairn_client.main", "serve", "--data", str(tmp_path / "data"), "--port", "0", *options],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    first.send_signal(signal.SIGTERM)
+    text, _ = first.communicate(timeout=60)
+    assert (first.returncode, second.returncode) == (0, 4)
+    assert ADMIN not in text + second.stdout + second.stderr
+    (refused,) = (json.loads(line) for line in f"{second.stdout}{second.stderr}".splitlines())
+    assert refused["message"].startswith("cairn serve: another server works on")
+    lines = [json.loads(line) for line in text.splitlines()]
+    memory, settings, stopped = (line for line in lines if line["logger"] == "cairn_server.life")
+    assert (started["event"], memory["event"], settings["event"]) == ("started", "memory", "settings")
+    assert (settings["admin_token"], settings["enrolment_token"]) == ("***", None)
+    assert settings["quotas.bytes_per_day"] == 128_000_000_000
+    assert "Invalid HTTP request received." in {line["message"] for line in lines}
+    (wrong,) = (line for line in lines if "wrong token from 127.0.0.1" in line["message"])
+    assert (wrong["level"], wrong["client"]) == ("warning", "127.0.0.1")
+    assert (stopped["event"], stopped["cause"], stopped) == ("stopped", "SIGTERM", lines[-1])
+    assert all(line["time"].endswith("Z") for line in lines)
+
+
+UNTIDY = """
+import sys, threading, warnings
+from cairn_server.http.middleware.log_format import LogForm, start_logging
+import logging
+start_logging(LogForm.JSON, logging.WARNING)
+sys.stderr.write("compiling kernels: one")
+sys.stderr.write(", 1 of 2\\n\\n")
+print("printed", file=sys.stderr)
+warnings.warn("old")
+thread = threading.Thread(target=lambda: 1 / 0)
+thread.start()
+thread.join()
+raise ValueError("in the end")
+"""
+
+
+@pytest.mark.processes
+def test_what_libraries_and_tracebacks_write_is_json_too() -> None:
+    done = subprocess.run([sys.executable, "-c", UNTIDY], capture_output=True, text=True, timeout=60, check=False)
+    lines = [json.loads(line) for line in done.stderr.splitlines()]
+    assert [line["message"] for line in lines[:2]] == ["compiling kernels: one, 1 of 2", "printed"]
+    assert "UserWarning: old" in lines[2]["message"]
+    assert [line["exception"].splitlines()[-1] for line in lines[3:]] == [
+        "ZeroDivisionError: division by zero",
+        "ValueError: in the end",
+    ]
+    assert done.returncode == 1
 
 
 @pytest.mark.processes

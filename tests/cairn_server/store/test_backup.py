@@ -1,8 +1,12 @@
 """Backup next to a running server, and restore."""
 
+import json
 import os
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import IO
 
 import apsw
 import pytest
@@ -123,6 +127,55 @@ def test_operators_take_a_new_incarnation_so_that_no_number_is_given_out_twice(
         made = other.retract(other.service.store.map(row.name), COMMITS[1]).json()["id"]
         assert made.split(".")[0] == lost.split(".")[0] == "operator"
         assert made.split(".")[1] != lost.split(".")[1]
+
+
+@pytest.mark.processes
+def test_a_backup_goes_into_a_pipe_and_comes_back_from_it(live: Live, row: MapRow, tmp_path: Path) -> None:
+    file = tmp_path / "piped.cairn"
+    with file.open("wb") as out:
+        done = in_process("backup", "--data", str(tmp_path / "data"), "-", stdout=out)
+    assert (done.returncode, done.stderr.count("standard output: 0.")) == (0, 1), done.stderr
+    assert sorted(path.name for path in (tmp_path / "data").iterdir() if "backup" in path.name) == []
+    assert main(["restore", str(file), "--data", str(tmp_path / "restored")]) == 0
+    with Live(tmp_path / "restored") as other:
+        assert read(other.cells(other.service.store.map(row.name))) == sum_of(COMMITS)
+
+
+@pytest.mark.processes
+def test_a_backup_of_which_the_reader_went_away_has_failed(live: Live, row: MapRow, tmp_path: Path) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = in_process("backup", "--data", str(tmp_path / "data"), "-", stdout=writer)
+    os.close(writer)
+    assert done.returncode != 0 and "the backup is not whole" in done.stderr
+
+
+def test_a_backup_is_not_written_to_a_terminal(
+    live: Live, row: MapRow, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True, raising=False)
+    with pytest.raises(BadInputError) as refused:
+        main(["backup", "--data", str(tmp_path / "data"), "-"])
+    assert refused.value.kind == "bad_backup"
+
+
+@pytest.mark.processes
+def test_a_backup_says_in_json_when_it_began_and_what_it_wrote(live: Live, row: MapRow, tmp_path: Path) -> None:
+    file = tmp_path / "nightly.cairn"
+    done = in_process("backup", "--data", str(tmp_path / "data"), str(file), "--log-format", "json")
+    begun, ended = (json.loads(line) for line in f"{done.stdout}{done.stderr}".splitlines())
+    assert (begun["message"], begun["file"]) == ("backup begun", str(file))
+    assert (ended["message"], ended["size_bytes"]) == ("backup done", file.stat().st_size)
+    assert 0 <= ended["seconds"] < 60
+    lost = in_process("backup", "--data", str(tmp_path / "none"), str(file), "--log-format", "json")
+    assert lost.returncode != 0
+    assert "[no_store]" in json.loads(lost.stderr.splitlines()[-1])["message"]
+
+
+def in_process(*arguments: str, stdout: IO[bytes] | int = subprocess.PIPE) -> subprocess.CompletedProcess[str]:
+    """A command of `cairn serve` as a process of its own."""
+    command = [sys.executable, "-m", "cairn_client.main", "serve", *arguments]
+    return subprocess.run(command, stdout=stdout, stderr=subprocess.PIPE, text=True, timeout=60, check=False)
 
 
 def test_what_is_no_backup_is_neither_replaced_nor_restored(live: Live, row: MapRow, tmp_path: Path) -> None:

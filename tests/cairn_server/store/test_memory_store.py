@@ -122,7 +122,7 @@ def test_a_guarded_server_keeps_its_tokens_and_its_audit_log_there(tmp_path: Pat
 
 
 def test_the_audit_log_keeps_its_newest_lines(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(memory_tokens, "AUDIT_LINES_MAX", 3)
+    monkeypatch.setattr(memory_tokens, "AUDIT_ROWS_MAX", 3)
     store = MemoryStore()
     for n in range(9):
         store.audit("test", str(n))

@@ -64,6 +64,7 @@ def test_an_older_store_opens_with_all_that_it_held_and_goes_on(name: str, tmp_p
 
 WITHOUT_EPOCHS = """
 DROP INDEX commits_epoch;
+ALTER TABLE audit DROP COLUMN client;
 ALTER TABLE age DROP COLUMN clock;
 DROP INDEX cell_listed;
 ALTER TABLE map DROP COLUMN epoch_s;
@@ -74,7 +75,7 @@ ALTER TABLE tile DROP COLUMN history_bytes;
 CREATE INDEX cell_listed ON cell (map, cell, lm, digest, fingerprint, voxels, size_bytes, gone_seq, hottest_k);
 PRAGMA user_version = 15;
 """
-"""SQL that takes the steps of epochs and of their clock back."""
+"""SQL that takes the steps of epochs, of their clock and of addresses back."""
 
 
 def test_a_store_of_before_epochs_opens_as_it_was_and_takes_maps_with_them(tmp_path: Path) -> None:

@@ -98,6 +98,7 @@ def test_a_store_of_the_first_step_takes_those_that_it_lacks(
 
 
 WITHOUT_EPOCHS = """
+ALTER TABLE audit DROP COLUMN client;
 ALTER TABLE age DROP COLUMN clock;
 ALTER TABLE map DROP COLUMN epoch_s;
 ALTER TABLE commits DROP COLUMN epoch;

@@ -250,6 +250,19 @@ def test_a_nursery_that_was_killed_is_made_anew(strict: Live) -> None:
     assert strict.push(row, pushed(1, 1)).status_code == 201
 
 
+@pytest.mark.slow
+def test_what_workers_write_to_standard_error_is_in_the_log(
+    strict: Live, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    nursery = pool_of(strict)._nursery
+    if nursery is not None:
+        nursery.kill()
+        nursery.wait()
+    monkeypatch.setenv("PYTHONPROFILEIMPORTTIME", "1")
+    assert strict.push(strict.new_map(), pushed(0, 1)).status_code == 201
+    until(lambda: "worker: import time:" in caplog.text, "its lines are there")
+
+
 @pytest.mark.processes
 def test_workers_end_with_a_server_that_was_killed(tmp_path: Path) -> None:
     process = Process(tmp_path)

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from cairn_client.cli.arguments import Subparsers, add_map_parser, api_of, say, shown_age, shown_bytes
 from cairn_client.sync.responses import one_line
 from cairn_map.wire.messages import BranchInfo
+from cairn_map.wire.utc_times import with_utc
 
 FAR_M = 1e7
 """Metres from which on centimetres are not shown: a pose may be anything."""
@@ -26,7 +27,7 @@ def _branches(args: argparse.Namespace) -> int:
     with api:
         branches = api.branches(name)
     if args.json:
-        say(json.dumps([branch.model_dump(mode="json") for branch in branches]))
+        say(json.dumps([with_utc(branch).model_dump(mode="json") for branch in branches]))
         return 0
     for line in branch_table(branches):
         say(line)

@@ -43,6 +43,7 @@ from cairn_client.http.api import MapApi
 from cairn_client.sync.responses import one_line
 from cairn_map.errors import BadInputError
 from cairn_map.wire.messages import Retract
+from cairn_map.wire.utc_times import with_utc
 
 DIGEST = re.compile("[0-9a-f]{64}")
 TIMES = ("pushed_after", "pushed_before", "captured_after", "captured_before")
@@ -103,7 +104,7 @@ def _info(args: argparse.Namespace) -> int:
     with api:
         info, branches = api.map_info(name), api.branches(name)
     if args.json:
-        branch_json = [branch.model_dump(mode="json") for branch in branches]
+        branch_json = [with_utc(branch).model_dump(mode="json") for branch in branches]
         say(json.dumps({**info.model_dump(mode="json"), "branch_list": branch_json}))
         return 0
     create.say_map(info)

@@ -28,6 +28,7 @@ from cairn_client.sync.responses import one_line
 from cairn_map.commits.cursor import cursor_from_text
 from cairn_map.errors import BadInputError
 from cairn_map.wire.messages import LogEntry
+from cairn_map.wire.utc_times import with_utc
 
 LANES_MAX = 24
 """Lanes of a drawing; lines that would need more are left out, and the caller says them in words."""
@@ -56,7 +57,7 @@ def _log(args: argparse.Namespace) -> int:
                 break
             entries += more
     if args.json:
-        say(json.dumps([entry.model_dump(mode="json") for entry in entries]))
+        say(json.dumps([with_utc(entry).model_dump(mode="json") for entry in entries]))
         return 0
     taken_out = {entry.id: entry.seq for entry in entries if entry.kind == "-"}
     listed = (_log_line(entry, taken_out.get(entry.id)) for entry in entries)

@@ -12,10 +12,11 @@
     $ cairn map query lab/ height --box=-5,-5,0,5,5,2         # the highest surface of each column, metres
     $ cairn map query lab/ --at 14:05 nearest 1,2,0.4         # as it was then, in a map with epochs
 
-A map is a URL, whose cells are all downloaded first, or a folder: one of `cairn map export --cells`, a clone, or the
-state folder of a robot that is not running. All lengths are
-metres in the map's frame, temperatures degrees Celsius here and kelvin in JSON; unknown values are `-`, in JSON null.
-Of a map with epochs, points have the time at which they were seen last, too: the beginning of its newest epoch, UTC.
+A map is a URL, whose cells are all downloaded first (the server itself finds the hottest, unless --at asks for the
+past), or a folder: one of `cairn map export --cells`, a clone, or the state folder of a robot that is not running. All
+lengths are metres in the map's frame, temperatures degrees Celsius here and kelvin in JSON; unknown values are `-`, in
+JSON null. Of a map with epochs, points have the time at which they were seen last, too: the beginning of its newest
+epoch, UTC.
 --json prints JSON for programs; `slice` and `height` then give all pixels, rows along y and columns along x.
 """
 
@@ -29,20 +30,24 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cairn_client.cli.arguments import Subparsers, add_at, add_token, say, seconds_of
+from cairn_client.cli.arguments import Subparsers, add_at, add_token, api_of, say, seconds_of
 from cairn_client.cli.robot_arguments import box, place
 from cairn_client.folders.map_folder import open_map
+from cairn_map.errors import BadInputError
 from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.voxels import Reading
 from cairn_map.queries.map_snapshot import MapSnapshot
 from cairn_map.queries.occupancy_states import State
 from cairn_map.queries.region_queries import MapImage
+from cairn_map.wire.hottest_messages import HOTTEST_MAX
 
 ZERO_CELSIUS_K = 273.15
 WIDTH = 100
 """Widest slice on a terminal, in characters."""
 SURENESS = f"{'probability':>12}{'hits':>6}{'misses':>7}"
 """Heads of the columns that say how sure a voxel is."""
+HOTTEST_HEAD = f"{'x m':>8}{'y m':>8}{'z m':>8}  {SURENESS}  temperature"
+NOTHING_HOT = "no occupied voxel has a temperature"
 SIGNS = {State.UNKNOWN: " ", State.FREE: ".", State.OCCUPIED: "#"}
 Answer = Callable[[MapSnapshot, argparse.Namespace], tuple[Any, list[str]]]
 """Answer to a question, as JSON and as lines for people."""
@@ -88,8 +93,12 @@ def add_parser(commands: Subparsers) -> None:
 
 def _run(args: argparse.Namespace) -> int:
     answer: Answer = args.answer
-    token = args.token.of(args.map) if "://" in args.map else None
-    found, lines = answer(open_map(args.map, token=token, at_s=seconds_of(args.at)), args)
+    is_server = "://" in args.map
+    if is_server and answer is _hottest and args.at is None:
+        found, lines = _hottest_of_server(args)
+    else:
+        token = args.token.of(args.map) if is_server else None
+        found, lines = answer(open_map(args.map, token=token, at_s=seconds_of(args.at)), args)
     for line in [json.dumps(found)] if args.json else lines:
         say(line)
     return 0
@@ -147,14 +156,32 @@ def _nearest(snapshot: MapSnapshot, args: argparse.Namespace) -> tuple[Any, list
 def _hottest(snapshot: MapSnapshot, args: argparse.Namespace) -> tuple[Any, list[str]]:
     voxels = snapshot.hottest(args.count, box_m=_corners(args))
     reading = voxels.of_kind(ChannelKind.TEMPERATURE)
-    found, lines = [], [f"{'x m':>8}{'y m':>8}{'z m':>8}  {SURENESS}  temperature"]
+    found, lines = [], [HOTTEST_HEAD]
     for n, (x, y, z) in enumerate(voxels.centres_m.tolist()):
         assert reading is not None  # noqa: S101 - or the snapshot had refused
         p, (hits, misses) = float(voxels.probability[n]), voxels.counts[n].tolist()
         sure = {"probability": p, "hits": hits, "misses": misses}
         found.append({"point_m": [x, y, z], **sure, **(_value(reading, n) or {})})
         lines.append(f"{x:8.3f}{y:8.3f}{z:8.3f}  {_sureness(p, hits, misses)}  {_shown(reading, n)}")
-    return found, lines if found else ["no occupied voxel has a temperature"]
+    return found, lines if found else [NOTHING_HOT]
+
+
+def _hottest_of_server(args: argparse.Namespace) -> tuple[Any, list[str]]:
+    """`_hottest`, of a map of which the server reads the hottest cells alone."""
+    if not 1 <= args.count <= HOTTEST_MAX:
+        raise BadInputError("bad_range", f"a server names 1 to {HOTTEST_MAX} voxels, not {args.count}")
+    api, name = api_of(args.map, args.token)
+    with api:
+        answer = api.hottest(name, count=args.count, box_m=args.box)
+    lines = [HOTTEST_HEAD]
+    for voxel in answer.voxels:
+        x, y, z = voxel.point_m
+        text = f"{x:8.3f}{y:8.3f}{z:8.3f}  {_sureness(voxel.probability, voxel.hits, voxel.misses)}"
+        lines.append(f"{text}  {_shown_kelvin(voxel.mean, voxel.sigma)}")
+    lines = lines if answer.voxels else [NOTHING_HOT]
+    if not answer.complete:
+        lines.append("(the server's search ended at its bounds, there may be hotter places: ask for a --box)")
+    return [voxel.model_dump(mode="json") for voxel in answer.voxels], lines
 
 
 def _slice(snapshot: MapSnapshot, args: argparse.Namespace) -> tuple[Any, list[str]]:
@@ -198,6 +225,10 @@ def _value(reading: Reading, n: int) -> dict[str, Any] | None:
     return value | {"spread": float(reading.spread[n]), "sigma": float(reading.sigma[n])}
 
 
+def _shown_kelvin(mean: float, sigma: float) -> str:
+    return f"{mean - ZERO_CELSIUS_K:.1f} C +- {sigma:.1f}"
+
+
 def _shown(reading: Reading, n: int) -> str:
     if not reading.weight[n]:
         return "-"
@@ -205,7 +236,7 @@ def _shown(reading: Reading, n: int) -> str:
     if reading.channel.kind is ChannelKind.COLOUR:
         return "({:.0f} {:.0f} {:.0f})".format(*mean)
     if reading.channel.kind is ChannelKind.TEMPERATURE and reading.sigma is not None:
-        return f"{mean - ZERO_CELSIUS_K:.1f} C +- {reading.sigma[n]:.1f}"
+        return _shown_kelvin(float(mean), float(reading.sigma[n]))
     return f"{mean:.4g} {reading.channel.unit}"
 
 

@@ -4,20 +4,32 @@
     {"time": "2026-01-02T03:04:05.678Z", "level": "info", "message": "request", "method": "PUT", ...}
 
 Fields are given as `extra=fields(map=..., size_bytes=...)`. Tokens are never given to a logger.
+
+As JSON, each line of both standard streams is one object: the server's start and end, tracebacks, warnings, and what
+any library writes to standard error. What a crash of the interpreter itself writes is not.
 """
 
+import argparse
+import io
 import json
 import logging
 import math
 import sys
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable
 from contextvars import ContextVar
 from enum import StrEnum
+from types import TracebackType
+from typing import TextIO
 
 REQUEST_ID: ContextVar[str] = ContextVar("request_id", default="")
 """Id of the request that this thread or task works for."""
+LIFE = logging.getLogger("cairn_server.life")
+"""Logger of a server's start and end, which go to standard output: as text the bare message."""
+STREAM = logging.getLogger("stderr")
+"""Logger of what is written to standard error, where its lines must be JSON."""
 HTTP_LIBRARY = "uvicorn.error"
 JUNK_EVERY_S = 60.0
 Field = str | int | float | bool | None
@@ -92,12 +104,76 @@ class JunkFilter(logging.Filter):
         return True
 
 
+def add_log_format(parser: argparse.ArgumentParser) -> None:
+    """Add the flag of the form of log lines."""
+    forms = [str(form) for form in LogForm]
+    parser.add_argument(
+        "--log-format",
+        choices=forms,
+        default=forms[0],
+        help=f"form of log lines and of all else it says ({forms[0]})",
+    )
+
+
 def start_logging(form: LogForm, level: int) -> None:
     """Log to standard error in this form, including what libraries log."""
+    is_json = form is LogForm.JSON
     handler = logging.StreamHandler(sys.stderr)
     handler.addFilter(JunkFilter())
-    handler.setFormatter(JsonFormatter() if form is LogForm.JSON else TextFormatter())
+    handler.setFormatter(JsonFormatter() if is_json else TextFormatter())
     logging.basicConfig(level=level, handlers=[handler], force=True)
+    life = _LifeHandler(sys.stdout)
+    life.setFormatter(JsonFormatter() if is_json else logging.Formatter("%(message)s"))
+    LIFE.handlers, LIFE.propagate = [life], False
+    LIFE.setLevel(logging.INFO)
+    if is_json:
+        _log_all_else()
+
+
+class _LifeHandler(logging.StreamHandler[TextIO]):
+    """Handler for standard output, whose reader may have gone away since the start."""
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        """Say nothing."""
+
+
+def _log_all_else() -> None:
+    """Log what would be written to standard error as text: uncaught exceptions, warnings, the lines of libraries."""
+    logging.raiseExceptions = False  # else a broken stream is complained of on that very stream
+    logging.captureWarnings(True)
+    STREAM.setLevel(logging.INFO)
+    sys.stderr = _LoggedLines()
+
+    def hook(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+        STREAM.critical("uncaught exception", exc_info=(kind, error, trace))
+
+    def thread_hook(found: threading.ExceptHookArgs) -> None:
+        if found.exc_value is not None and not isinstance(found.exc_value, SystemExit):
+            hook(found.exc_type, found.exc_value, found.exc_traceback)
+
+    sys.excepthook = hook
+    threading.excepthook = thread_hook
+
+
+class _LoggedLines(io.TextIOBase):
+    """Stream each of whose lines becomes a line of the log; called from many threads."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._begun = ""
+
+    def writable(self) -> bool:
+        """Always."""
+        return True
+
+    def write(self, text: str) -> int:
+        """Log the lines that are whole."""
+        with self._lock:
+            *lines, self._begun = f"{self._begun}{text}".split("\n")
+        for line in lines:
+            if line.strip():
+                STREAM.info("%s", line.rstrip())
+        return len(text)
 
 
 def _fields_of(record: logging.LogRecord) -> dict[str, Field]:

@@ -13,8 +13,10 @@ from collections.abc import Callable, MutableMapping
 from dataclasses import dataclass
 from typing import Any
 
+from cairn_server.access.auth import Caller
 from cairn_server.http.middleware.asgi import App, Message, Receive, Send
 from cairn_server.http.middleware.log_format import REQUEST_ID, Field, fields
+from cairn_server.http.middleware.token_first import STATE
 from cairn_server.metrics import ServerFigures
 
 log = logging.getLogger(__name__)
@@ -25,6 +27,7 @@ TIME_HEADER, FORMAT_HEADER = b"cairn-time", b"cairn-format"
 SENSIBLE = re.compile(rb"[A-Za-z0-9._-]{1,64}")
 METHODS = frozenset({"GET", "PUT", "POST", "DELETE", "HEAD", "OPTIONS", "PATCH"})
 PUSH = "/maps/{name}/commits/{commit}"
+CHANGING = frozenset({"PUT", "POST", "DELETE", "PATCH"})
 QUIET = frozenset({"/healthz", "/readyz", "/metrics"})
 """Routes that machines ask every few seconds: logged at level DEBUG."""
 OUTCOMES = {201: "new", 200: "known"}
@@ -107,6 +110,8 @@ class RequestTrail:
             figures.errors.labels(trail.kind).inc()
         if route == PUSH and method == "PUT":
             self._note_push(scope["path_params"].get("name", ""), trail)
+        if method in CHANGING:
+            self._note_robot(scope, route, trail)
         level = logging.WARNING if trail.status >= 500 else logging.DEBUG if route in QUIET else logging.INFO
         if log.isEnabledFor(level):
             log.log(level, "request", extra=fields(**_line(scope, method, route, trail, seconds)))
@@ -117,6 +122,19 @@ class RequestTrail:
         self._figures.pushes.labels(name if outcome else "", outcome or trail.kind or "cut_off").inc()
         if outcome == "new":
             self._figures.push_bytes.labels(name).inc(trail.received_bytes)
+
+    def _note_robot(self, scope: MutableMapping[str, Any], route: str, trail: Trail) -> None:
+        """Count what a robot's token brought, or was refused."""
+        caller: Caller | None = scope.get("state", {}).get(STATE)
+        # A token of another map is answered 401, and so no name of a map that a client guesses is a label.
+        if caller is None or caller.robot is None or trail.status == 401:
+            return
+        of = scope.get("path_params", {}).get("name", ""), caller.robot
+        if trail.kind:
+            self._figures.robot_refusals.labels(*of, trail.kind).inc()
+        elif route == PUSH and OUTCOMES.get(trail.status) == "new":
+            self._figures.robot_commits.labels(*of).inc()
+            self._figures.robot_bytes.labels(*of).inc(trail.received_bytes)
 
 
 def _request_id(headers: list[tuple[bytes, bytes]]) -> str:

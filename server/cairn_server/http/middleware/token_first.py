@@ -11,6 +11,8 @@ import re
 from collections.abc import Hashable, Iterable, MutableMapping
 from typing import Any
 
+from starlette.concurrency import run_in_threadpool
+
 from cairn_map.errors import BadInputError, CairnError, DeniedError
 from cairn_server.access.auth import Caller, Role
 from cairn_server.access.own_names import OwnNames
@@ -23,6 +25,8 @@ REGISTRATION = re.compile(r"/maps/([^/]*)/branches")
 DROPPED_BYTES_MAX = 1 << 14
 """Largest body that is read of a request which is refused at its head."""
 TOKEN_PREFIX = "cairn.token."  # noqa: S105 - what stands before one
+WRONG = frozenset({"bad_token", "unconfirmed_token"})
+"""Kinds of the refusals that are about a token which was shown."""
 STATE = "caller"
 """Name of the caller's note in the request's state."""
 
@@ -41,6 +45,7 @@ class TokenFirst:
             try:
                 caller = self._caller(scope)
             except (DeniedError, BadInputError) as exc:
+                await self._note(scope, exc)
                 # What needs no body may need no token either: that is the route's to know.
                 if scope["type"] == "http" and scope["method"] not in WITHOUT_BODY:
                     await _drop_small_body(scope, receive)
@@ -51,6 +56,15 @@ class TokenFirst:
             else:
                 scope.setdefault("state", {})[STATE] = caller
         await self._app(scope, receive, send)
+
+    async def _note(self, scope: MutableMapping[str, Any], exc: CairnError) -> None:
+        """Write a line about a wrong token, if it is one and worth a line."""
+        if exc.kind not in WRONG:
+            return
+        address = scope["client"][0] if scope.get("client") else ""
+        left_out = self._service.wrong_tokens.turn(address)
+        if left_out is not None:
+            await run_in_threadpool(self._service.wrong_tokens.write, address, exc.kind, left_out)
 
     def _caller(self, scope: MutableMapping[str, Any]) -> Caller:
         """Caller of a request, by its token, or where it registers a robot by the proof of the robot's key."""

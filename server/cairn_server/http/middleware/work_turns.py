@@ -5,7 +5,7 @@ together have fewer places than there are threads, so none waits in a thread for
 is whole, and ends with the first byte of its answer: slow links hold none. Work that may take long ends with its
 connection (`access.cancellation`). Plain ASGI.
 
-    missing 8, pictures 2, exports 2, changes 2, files of cells 1, all others 24  <  40 threads (anyio's default)
+    missing 8, pictures 2, exports 2, searches 2, files of cells 1, all others 24  <  40 threads (anyio's default)
 """
 
 import asyncio
@@ -30,7 +30,7 @@ WAIT_S = 30.0
 PICTURE_WAIT_S = 5.0
 MISSING = re.compile(r"/maps/[^/]*/branches/[^/]*/missing")
 PICTURES = re.compile(r"/maps/[^/]*/main/render")
-CHANGES = re.compile(r"/maps/[^/]*/main/changes")
+SEARCHES = re.compile(r"/maps/[^/]*/main/(changes|hottest)")
 CELL_FILES = re.compile(r"/maps/[^/]*/main/cells/[^/]*\.(npz|ply)")
 EXPORTS = re.compile(r"/maps/[^/]*/main/export(/tickets)?")
 
@@ -51,7 +51,7 @@ class Lanes:
         self._by_path = {
             MISSING: Lane(Turns(places=8, share=1, wait_s=WAIT_S)),
             PICTURES: Lane(Turns(places=RENDERS_AT_ONCE, share=1, wait_s=PICTURE_WAIT_S)),
-            CHANGES: Lane(Turns(places=SEARCHES_AT_ONCE, share=1, wait_s=PICTURE_WAIT_S)),
+            SEARCHES: Lane(Turns(places=SEARCHES_AT_ONCE, share=1, wait_s=PICTURE_WAIT_S)),
             CELL_FILES: Lane(Turns(places=1, share=1, wait_s=PICTURE_WAIT_S)),
             EXPORTS: Lane(Turns(places=COUNTS_AT_ONCE, share=1, wait_s=PICTURE_WAIT_S)),
         }

@@ -17,6 +17,7 @@ from cairn_server.http.routes.callers import (
     Map,
     Operations,
     OwnOrigins,
+    Times,
     allowed,
     body_of,
     own_branch,
@@ -60,21 +61,21 @@ def register(
     author = Author(RobotName(body.robot), Incarnation(body.incarnation))
     with service.sync.admissions.registering(row, caller, author, cairn_proof, own=own) as grounds:
         registered = service.maps.register(row, body, grounds)
-    service.store.audit_log.add(caller.name, "register", f"map {row.name}: {body.robot}")
+    service.store.audit_log.add(caller.name, "register", f"map {row.name}: {body.robot}", client=caller.address)
     return registered
 
 
 @router.get("/maps/{name}/branches", dependencies=READERS)
-def list_branches(service: Operations, row: Map) -> list[BranchInfo]:
+def list_branches(service: Operations, row: Map, times: Times) -> list[BranchInfo]:
     """All robots, and how far behind each is."""
-    return service.maps.branches(row)
+    return [times(branch) for branch in service.maps.branches(row)]
 
 
 @router.delete("/maps/{name}/branches/{branch}", status_code=204)
 def deregister(branch: str, service: Operations, row: Map, caller: Annotated[Caller, Depends(own_branch)]) -> None:
     """Deregister a robot; its evidence stays."""
     service.maps.deregister(row, branch)
-    service.store.audit_log.add(caller.name, "deregister", f"map {row.name}: {branch}")
+    service.store.audit_log.add(caller.name, "deregister", f"map {row.name}: {branch}", client=caller.address)
 
 
 @router.put(
@@ -155,7 +156,8 @@ def close_robot(
 ) -> RobotClosed:
     """Close all incarnations of a robot: they take no new commits, and its shares are whole again."""
     closed = service.store.shares.close(row, robot)
-    service.store.audit_log.add(caller.name, "close_robot", f"map {row.name}: {robot}, {closed.authors} incarnations")
+    detail = f"map {row.name}: {robot}, {closed.authors} incarnations"
+    service.store.audit_log.add(caller.name, "close_robot", detail, client=caller.address)
     return RobotClosed(robot=robot, incarnations=closed.authors, intervals=closed.intervals)
 
 
@@ -166,9 +168,10 @@ def challenge(service: Operations) -> Challenge:
 
 
 @router.get("/maps/{name}/keys", dependencies=[Depends(allowed(Role.OPERATOR))])
-def list_keys(service: Operations, row: Map) -> RobotKeyList:
+def list_keys(service: Operations, row: Map, times: Times) -> RobotKeyList:
     """Keys that robots' names are bound to, and the robots that were refused for theirs."""
-    return service.sync.admissions.list(row)
+    keys: RobotKeyList = times(service.sync.admissions.list(row))
+    return keys
 
 
 @router.put("/maps/{name}/keys/{author}", status_code=204)

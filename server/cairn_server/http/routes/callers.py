@@ -6,8 +6,8 @@ token is looked up by its key, which takes some 40 us and waits for no writer.
 """
 
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
-from typing import Annotated
+from dataclasses import dataclass, replace
+from typing import Annotated, Any
 
 from fastapi import Depends, Header, Request
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
@@ -16,6 +16,7 @@ from starlette.requests import HTTPConnection
 from cairn_map.commits.commit import EPOCH_VERSION, SUM_VERSION
 from cairn_map.commits.key_proof import PROOF_TEXT_MAX
 from cairn_map.errors import BadInputError, DeniedError, NotFoundError
+from cairn_map.wire.utc_times import with_utc
 from cairn_server.access.auth import READING, Caller, Role, bad_token, require, require_all_maps
 from cairn_server.access.own_names import OwnNames
 from cairn_server.service import Service
@@ -40,6 +41,8 @@ class Asker:
 
     service: Service
     credentials: HTTPAuthorizationCredentials | None
+    address: str
+    """Address of the client."""
 
     def map(self, name: str) -> MapRow:
         """The map of a name; clients without access to all maps cannot find out which names exist."""
@@ -53,7 +56,7 @@ class Asker:
     def caller(self, row: MapRow | None) -> Caller:
         """The caller, on a map or (None) where none is named; a token of one map counts on that map only."""
         token = self.credentials.credentials if self.credentials else None
-        return self.service.holders.of(token, row)
+        return replace(self.service.holders.of(token, row), address=self.address)
 
     def reader(self, name: str) -> MapRow:
         """The map of a name, if the caller may read it."""
@@ -64,14 +67,28 @@ class Asker:
 
 async def asker_of(request: Request, credentials: Credentials) -> Asker:
     """The client of a request."""
-    return _asker(request, credentials)
+    return asker_for(request, credentials)
 
 
-def _asker(request: HTTPConnection, credentials: HTTPAuthorizationCredentials | None) -> Asker:
-    return Asker(request.app.state.service, credentials)
+def asker_for(request: HTTPConnection, credentials: HTTPAuthorizationCredentials | None) -> Asker:
+    """The client of a request or a stream, by what it showed."""
+    address = request.client.host if request.client is not None else ""
+    return Asker(request.app.state.service, credentials, address)
 
 
 Asking = Annotated[Asker, Depends(asker_of)]
+
+
+async def times_for(cairn_protocol: Annotated[str | None, Header(max_length=8)] = None) -> Callable[[Any], Any]:
+    """Function that adds the times of an answer in ISO 8601 for people, who state no version of the protocol."""
+    return _unchanged if cairn_protocol is not None else with_utc
+
+
+def _unchanged(message: Any) -> Any:
+    return message
+
+
+Times = Annotated[Callable[[Any], Any], Depends(times_for)]
 
 
 async def map_of(name: str, asker: Asking) -> MapRow:
@@ -148,7 +165,8 @@ async def registrar(
     except DeniedError:
         if asker.credentials is not None or cairn_proof is None:
             raise
-        return asker.service.sync.admissions.returning(row.name, cairn_proof, own=own)
+        returning = asker.service.sync.admissions.returning(row.name, cairn_proof, own=own)
+        return replace(returning, address=asker.address)
     require(caller, Role.ENROLLER)
     return caller
 
@@ -207,7 +225,7 @@ async def visiting_owner(name: str, branch: str, request: Request) -> Visit:
 
 
 async def _visit(name: str, request: Request) -> Visit:
-    asker = _asker(request, await bearer(request))
+    asker = asker_for(request, await bearer(request))
     row = asker.map(name)
     return Visit(asker.service, row, asker.caller(row), await format_of(request.headers.get("cairn-format")))
 
@@ -221,7 +239,7 @@ async def body_of(request: Request) -> bytes:
     data = await request.body()
     credentials = await bearer(request)
     if credentials is not None:
-        _asker(request, credentials).caller(None)
+        asker_for(request, credentials).caller(None)
     return data
 
 

@@ -169,7 +169,7 @@ def heal_cell(
     data: Annotated[bytes, Depends(body_of)],
 ) -> None:
     """Restore a cell that the server's disk damaged: only exactly the bytes that it had are accepted."""
-    service.cells.heal(row, cell_key(cell_from_text(cell)), data, by=caller.name)
+    service.cells.heal(row, cell_key(cell_from_text(cell)), data, by=caller.name, client=caller.address)
 
 
 def _whole_or_part(

@@ -1,4 +1,4 @@
-"""Routes by which a map leaves the server: as a picture, as a file of points or an octree, or as what changed."""
+"""Routes by which a map leaves the server: as a picture, a file of points or an octree, what changed, what is hot."""
 
 from functools import partial
 from typing import Annotated, Any
@@ -12,6 +12,7 @@ from cairn_map.errors import DeniedError
 from cairn_map.files.export_request import BOX_CHARS_MAX, EXPORT_TYPES, ExportRequest, ExportTicket, TicketedExport
 from cairn_map.render.render_request import RenderRequest
 from cairn_map.wire.change_messages import ChangesAnswer
+from cairn_map.wire.hottest_messages import HOTTEST_MAX, HottestAnswer
 from cairn_server.access.connection_places import ConnectionPlace
 from cairn_server.http.middleware.deadlines import PLACE
 from cairn_server.http.routes.callers import READERS, Asking, Credentials, Map, Operations
@@ -84,6 +85,19 @@ def changes(
 ) -> ChangesAnswer:
     """Voxels that appeared, went, moved by a voxel, or became warmer or colder after a time, by capture."""
     return service.views.changes.asked(row, since, until, box)
+
+
+@router.get("/maps/{name}/main/hottest", dependencies=READERS)
+def hottest(
+    service: Operations,
+    row: Map,
+    count: Annotated[int, Query(ge=1, le=HOTTEST_MAX)] = 10,
+    box: Annotated[
+        str | None, Query(max_length=BOX_CHARS_MAX, description="x0,y0,z0,x1,y1,z1: metres, map frame")
+    ] = None,
+) -> HottestAnswer:
+    """The occupied voxels of the highest temperature: first those that were seen twice or touch a surface."""
+    return service.views.hottest.asked(row, count, box)
 
 
 async def map_without_ticket(name: str, request: Request, asker: Asking) -> MapRow | None:

@@ -23,11 +23,10 @@ from cairn_map.errors import BadInputError, CairnError, DeniedError
 from cairn_map.wire.live_events import Beat, EventPosition, LiveEvent, position_from_text
 from cairn_server.access.auth import READING, require
 from cairn_server.http.middleware.token_first import offered_token
-from cairn_server.http.routes.callers import READERS, Asker, Asking, Map
+from cairn_server.http.routes.callers import READERS, Asker, Asking, Map, asker_for
 from cairn_server.http.routes.documentation import answers, problems
 from cairn_server.http.routes.problems import answer_to
 from cairn_server.live.hub import Listener
-from cairn_server.service import Service
 from cairn_server.store.store_rows import MapRow
 
 log = logging.getLogger(__name__)
@@ -167,10 +166,9 @@ def live_without_upgrade() -> None:
 @router.websocket("/maps/{name}/live")
 async def live(socket: WebSocket, name: str, after: After = None) -> None:
     """The same events as JSON texts."""
-    service: Service = socket.app.state.service
     try:
         _check_origin(socket)
-        asker = Asker(service, _credentials(socket))
+        asker = asker_for(socket, _credentials(socket))
         row = await run_in_threadpool(asker.reader, name)
         stream = _Stream(asker, row)
         await stream.join(position_from_text(after or ""))

@@ -8,7 +8,7 @@ from cairn_map.commits.commit import EPOCH_VERSION
 from cairn_map.wire.live_events import NAMES_MAX
 from cairn_map.wire.messages import CreateMap, LogEntry, MapInfo, Retract, Retracted
 from cairn_server.access.auth import READING, Caller, Role
-from cairn_server.http.routes.callers import READERS, Format, Map, Operations, admin, allowed, reader_somewhere
+from cairn_server.http.routes.callers import READERS, Format, Map, Operations, Times, admin, allowed, reader_somewhere
 from cairn_server.http.routes.documentation import also, json_body, problems
 from cairn_server.http.routes.json_bodies import json_of
 
@@ -46,7 +46,7 @@ def create_map(
     """Create a map; 200 if an equal one exists."""
     info, is_new = service.maps.create(name, body)
     if is_new:
-        service.store.audit_log.add(caller.name, "create_map", name)
+        service.store.audit_log.add(caller.name, "create_map", f"map {name}: created", client=caller.address)
     response.status_code = 201 if is_new else 200
     return _known_facts(info, known)
 
@@ -83,9 +83,10 @@ def retract(
 def log(
     service: Operations,
     row: Map,
+    times: Times,
     after: Annotated[int, Query(ge=0, lt=1 << 63)] = 0,
     limit: Annotated[int, Query(ge=1, le=LOG_PAGE_MAX)] = 100,
 ) -> list[LogEntry]:
     """Log entries, oldest first."""
     with service.store.snapshot(row) as snapshot:
-        return snapshot.log(after_seq=after, limit=limit, names_max=NAMES_MAX)
+        return [times(entry) for entry in snapshot.log(after_seq=after, limit=limit, names_max=NAMES_MAX)]

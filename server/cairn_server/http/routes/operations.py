@@ -5,16 +5,19 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Query
 from fastapi.responses import PlainTextResponse
 
+from cairn_map.epochs.moment import TimeText, time_from_text
 from cairn_map.errors import UnreachableError
 from cairn_map.wire.access_messages import AuditEntry, CreateToken, NewSecret, SiteInfo, TokenInfo, TrustedTime
 from cairn_server.access.auth import Caller
 from cairn_server.access.tokens import confirm_token, create_token, list_tokens, revoke_token, rotate_token
-from cairn_server.http.routes.callers import ADMIN, Asking, Operations, admin, reader_somewhere
+from cairn_server.http.routes.callers import ADMIN, Asking, Operations, Times, admin, reader_somewhere
 from cairn_server.http.routes.documentation import json_body, problems
 from cairn_server.http.routes.json_bodies import json_of
 from cairn_server.metrics import MEDIA_TYPE
+from cairn_server.store.store_rows import NUMBER_LIMIT, AuditChoice
 
 AUDIT_PAGE_MAX = 1000
+AUDIT_TEXT_MAX = 128
 
 router = APIRouter()
 Admin = Annotated[Caller, Depends(admin)]
@@ -56,7 +59,7 @@ def metrics(service: Operations) -> PlainTextResponse:
 @router.post("/clock", responses=problems(409))
 def trust_clock(service: Operations, caller: Admin) -> TrustedTime:
     """Trust the time of day as it is now."""
-    return TrustedTime(time_s=service.clock.trust(by=caller.name))
+    return TrustedTime(time_s=service.clock.trust(by=caller.name, client=caller.address))
 
 
 @router.get("/servers", dependencies=[Depends(reader_somewhere)], response_model_exclude_defaults=True)
@@ -66,9 +69,9 @@ def get_servers(service: Operations) -> SiteInfo:
 
 
 @router.get("/tokens", dependencies=ADMIN)
-def get_tokens(service: Operations) -> list[TokenInfo]:
+def get_tokens(service: Operations, times: Times) -> list[TokenInfo]:
     """All tokens, without their secrets."""
-    return list_tokens(service.store)
+    return [times(token) for token in list_tokens(service.store)]
 
 
 @router.put("/tokens/{token}", status_code=201, responses=problems(409), openapi_extra=json_body(CreateToken))
@@ -100,8 +103,24 @@ def delete_token(token: str, service: Operations, caller: Admin) -> None:
 @router.get("/audit", dependencies=ADMIN)
 def get_audit(
     service: Operations,
-    after: Annotated[int, Query(ge=0, lt=1 << 63)] = 0,
+    times: Times,
+    after: Annotated[int, Query(ge=0, lt=NUMBER_LIMIT)] = 0,
+    before: Annotated[int | None, Query(ge=0, lt=NUMBER_LIMIT, description="newest first, those below it")] = None,
+    newest: Annotated[bool, Query(description="newest first")] = False,
     limit: Annotated[int, Query(ge=1, le=AUDIT_PAGE_MAX)] = 100,
+    who: Annotated[str | None, Query(max_length=AUDIT_TEXT_MAX)] = None,
+    what: Annotated[str | None, Query(max_length=AUDIT_TEXT_MAX)] = None,
+    about: Annotated[str | None, Query(alias="map", max_length=AUDIT_TEXT_MAX, description="name of a map")] = None,
+    since: Annotated[TimeText | None, Query()] = None,
+    until: Annotated[TimeText | None, Query()] = None,
 ) -> list[AuditEntry]:
-    """Lines of the audit log, oldest first."""
-    return service.store.audit_log.page(after=after, limit=limit)
+    """Lines of the audit log, oldest first; with `newest` or `before` newest first."""
+    choice = AuditChoice(who=who, what=what, map=about, since_s=_time_s(since), until_s=_time_s(until))
+    if newest and before is None:
+        before = NUMBER_LIMIT - 1
+    page = service.store.audit_log.page(after=after, before=before, limit=limit, choice=choice)
+    return [times(line) for line in page]
+
+
+def _time_s(text: str | None) -> float | None:
+    return None if text is None else time_from_text(text)

@@ -364,6 +364,9 @@ CLOCK = """
 ALTER TABLE age ADD COLUMN clock text;              -- `store_clock.ClockMark`, as JSON
 CREATE INDEX commits_epoch ON commits (map, epoch) WHERE epoch IS NOT NULL;
 """
+ADDRESSES = """
+ALTER TABLE audit ADD COLUMN client text NOT NULL DEFAULT '';       -- address that a request came from
+"""
 BOUND_OLDEST = 4
 """Oldest step whose programs read a store of which bytes are in an object store."""
 
@@ -377,7 +380,9 @@ class Step:
     """Number of the oldest step whose programs work on a database that took this one."""
 
 
-STEPS = tuple(Step(sql, oldest=1) for sql in (FIRST, REPLICAS, SERVERS, OBJECTS, OWNED_OBJECTS, EPOCHS, CLOCK))
+STEPS = tuple(
+    Step(sql, oldest=1) for sql in (FIRST, REPLICAS, SERVERS, OBJECTS, OWNED_OBJECTS, EPOCHS, CLOCK, ADDRESSES)
+)
 
 
 def prepare(url: str, *, has_objects: bool = False) -> None:

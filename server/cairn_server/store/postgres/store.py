@@ -243,11 +243,11 @@ class PgStore(PgReads):
         own_s = self.age.now_s()
         self._threads.note(lambda connection: self.age.follow(first(connection, TICK, {"own_s": own_s})[0]))
 
-    def audit(self, what: str, detail: str) -> None:
+    def audit(self, what: str, detail: str, *, client: str = "") -> None:
         """Note something that an administrator may have to look into."""
-        log.warning("%s: %r", what, detail)
+        log.warning("%s: %r", what, detail, extra={"fields": {"client": client} if client else {}})
         with suppress(UnreachableError):
-            self.audit_log.add("server", what, detail)
+            self.audit_log.add("server", what, detail, client=client)
 
     def close(self) -> None:
         """Finish what was accepted and close."""

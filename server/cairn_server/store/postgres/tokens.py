@@ -7,19 +7,28 @@ from concurrent.futures import Future
 from dataclasses import dataclass, field
 
 from cairn_map.errors import ConflictError
-from cairn_map.wire.access_messages import AuditEntry, audit_chain
+from cairn_map.wire.access_messages import AuditEntry, AuditText, audit_chain
 from cairn_server.store.known_tokens import KnownTokens, check_changed, token_row
 from cairn_server.store.postgres.connections import Connection, Connections, first, rows
 from cairn_server.store.postgres.schema import NOW_S
 from cairn_server.store.postgres.writing_threads import WritingThreads
 from cairn_server.store.store_age import StoreAge
-from cairn_server.store.store_rows import MapRow, Token, registration_name
+from cairn_server.store.store_rows import (
+    ALL_LINES,
+    AUDIT_COLUMNS,
+    AUDIT_ROWS_MAX,
+    NUMBER_LIMIT,
+    AuditChoice,
+    MapRow,
+    Token,
+    audit_entry,
+    registration_name,
+)
 
 log = logging.getLogger(__name__)
 
 USED_EVERY_S = 10.0
 """Time between two writes of all tokens' times of last use."""
-AUDIT_ROWS_MAX = 100_000
 SERVER_STREAM = "server"
 """Stream of the lines that are about the server."""
 _SELECT = (
@@ -133,9 +142,7 @@ class PgTokens:
 class _WaitingLine:
     """A line of the audit log, and that it is durable."""
 
-    who: str
-    what: str
-    detail: str
+    said: AuditText
     written: "Future[None]" = field(default_factory=Future)
 
     def __post_init__(self) -> None:
@@ -144,7 +151,7 @@ class _WaitingLine:
         Raises:
             UnicodeEncodeError: half of a surrogate pair.
         """
-        f"{self.who}{self.what}{self.detail}".encode()
+        f"{self.said.who}{self.said.what}{self.said.detail}{self.said.client}".encode()
 
 
 class PgAuditLog:
@@ -160,10 +167,10 @@ class PgAuditLog:
         self._turn = threading.Lock()
         self._waiting: list[_WaitingLine] = []
 
-    def add(self, who: str, what: str, detail: str) -> None:
+    def add(self, who: str, what: str, detail: str, *, client: str = "") -> None:
         """One more line; durable on return."""
         log.info("%s: %s: %r", who, what, detail)
-        line = _WaitingLine(who, what, detail)
+        line = _WaitingLine(AuditText(who, what, detail, client))
         with self._lock:
             self._waiting.append(line)
         with self._turn:
@@ -178,7 +185,7 @@ class PgAuditLog:
 
         def job(connection: Connection) -> None:
             for line in lines:
-                write_audit(connection, SERVER_STREAM, line.who, line.what, line.detail)
+                write_audit(connection, SERVER_STREAM, line.said)
 
         try:
             self._connections.run(job)
@@ -189,31 +196,32 @@ class PgAuditLog:
         for line in lines:
             line.written.set_result(None)
 
-    def page(self, *, after: int, limit: int) -> list[AuditEntry]:
-        """Lines numbered above `after`, oldest first."""
-        query = (
-            "SELECT number, time_s, who, what, detail, chain FROM audit WHERE stream = %s AND number > %s"
-            " ORDER BY number LIMIT %s"
-        )
+    def page(
+        self, *, limit: int, after: int = 0, before: int | None = None, choice: AuditChoice = ALL_LINES
+    ) -> list[AuditEntry]:
+        """Lines of a choice, oldest first, or with `before` newest first."""
+        conditions, values = choice.conditions("%s")
+        where = " AND ".join(["stream = %s", "number > %s", "number < %s", *conditions])
+        order = "number" if before is None else "number DESC"
+        query = f"SELECT {AUDIT_COLUMNS} FROM audit WHERE {where} ORDER BY {order} LIMIT %s"
+        limits = (after, NUMBER_LIMIT - 1 if before is None else before)
         with self._connections.lent() as connection:
-            found = rows(connection, query, (SERVER_STREAM, after, limit))
-        return [
-            AuditEntry(number=number, time_s=time_s, who=who, what=what, detail=detail, chain=chain.hex())
-            for number, time_s, who, what, detail, chain in found
-        ]
+            found = rows(connection, query, (SERVER_STREAM, *limits, *values, limit))
+        return [audit_entry(row) for row in found]
 
 
-def write_audit(connection: Connection, stream: str, who: str, what: str, detail: str) -> None:
+def write_audit(connection: Connection, stream: str, said: AuditText) -> None:
     """One more line of a stream, chained to its last, inside a transaction; the newest lines are kept."""
-    who, what, detail = (text.replace("\0", "\\0") for text in (who, what, detail))
+    said = AuditText(*(text.replace("\0", "\\0") for text in (said.who, said.what, said.detail, said.client)))
     connection.execute("INSERT INTO audit_head VALUES (%s, 0, '') ON CONFLICT DO NOTHING", (stream,))
     query = f"SELECT number, chain, {NOW_S} FROM audit_head WHERE stream = %s FOR NO KEY UPDATE"
     last, before, time_s = first(connection, query, (stream,))
     number = last + 1
-    chain = audit_chain(before, number, time_s, who=who, what=what, detail=detail)
+    chain = audit_chain(before, number, time_s, said)
     connection.execute(
-        "INSERT INTO audit (stream, number, time_s, who, what, detail, chain) VALUES (%s, %s, %s, %s, %s, %s, %s)",
-        (stream, number, time_s, who, what, detail, chain),
+        "INSERT INTO audit (stream, number, time_s, who, what, detail, chain, client)"
+        " VALUES (%s, %s, %s, %s, %s, %s, %s, %s)",
+        (stream, number, time_s, said.who, said.what, said.detail, chain, said.client),
     )
     query = "UPDATE audit_head SET number = %s, chain = %s WHERE stream = %s"
     connection.execute(query, (number, chain, stream))

@@ -6,11 +6,14 @@ write-ahead log. The copy has its name only when all of it is on the disk.
 """
 
 import os
+import shutil
 import struct
+import tempfile
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 import apsw
 
@@ -48,9 +51,7 @@ def back_up(folder: Path, target: Path, report: Report) -> int:
             `bad_store`: this user may not read the store.
         DamagedDataError: kind `damaged_store`: the store cannot be read.
     """
-    source = folder / FILE_NAME
-    if not source.is_file():
-        raise NotFoundError("no_store", f"{folder} has no store; name the folder that `cairn serve --data` works on")
+    source = _store_in(folder)
     try:
         is_free = not target.exists()
     except OSError as exc:
@@ -62,6 +63,38 @@ def back_up(folder: Path, target: Path, report: Report) -> int:
     size_bytes = target.stat().st_size
     note_backup(folder, str(target.absolute()), size_bytes)
     return size_bytes
+
+
+def send_backup(folder: Path, stream: BinaryIO, report: Report) -> int:
+    """Write a copy of the store of a folder to a stream; its size in bytes.
+
+    SQLite copies pages in an order of its own, into a file: the folder has room for the copy until all of it is sent.
+
+    Raises:
+        NotFoundError, DamagedDataError: as `back_up`.
+        BadInputError: kind `bad_backup`: there is no room for the copy, or the reader of the stream went away.
+    """
+    source = _store_in(folder)
+    try:
+        with tempfile.TemporaryDirectory(prefix="backup-", dir=folder) as name:
+            path = Path(name) / "copy"
+            _copy(source, path, report, shown=path)
+            copy = path.open("rb")
+        with copy:
+            shutil.copyfileobj(copy, stream)
+            stream.flush()
+            size_bytes = copy.tell()
+    except OSError as exc:
+        raise BadInputError("bad_backup", f"the backup is not whole, it cannot be written: {exc}") from exc
+    note_backup(folder, "standard output", size_bytes)
+    return size_bytes
+
+
+def _store_in(folder: Path) -> Path:
+    source = folder / FILE_NAME
+    if not source.is_file():
+        raise NotFoundError("no_store", f"{folder} has no store; name the folder that `cairn serve --data` works on")
+    return source
 
 
 @dataclass(frozen=True, slots=True)

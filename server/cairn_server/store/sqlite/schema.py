@@ -309,6 +309,10 @@ ALTER TABLE age ADD COLUMN clock TEXT;              -- `store_clock.ClockMark`, 
 CREATE INDEX commits_epoch ON commits (map, epoch) WHERE epoch IS NOT NULL;
 """
 
+ADDRESSES = """
+ALTER TABLE audit ADD COLUMN client TEXT NOT NULL DEFAULT '';       -- address that a request came from
+"""
+
 STEPS = (
     FIRST,
     STAMPS,
@@ -327,6 +331,7 @@ STEPS = (
     TILES,
     EPOCHS,
     CLOCK,
+    ADDRESSES,
 )
 
 

@@ -20,6 +20,7 @@ from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import BadInputError, NotFoundError, UnreachableError
 from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
+from cairn_map.wire.access_messages import AuditText
 from cairn_server.store.admission import OWN_WORD, Grounds
 from cairn_server.store.branch_signs import LastSeen
 from cairn_server.store.folder_lock import lock_folder
@@ -305,11 +306,12 @@ class SqliteStore(SqliteReads):
                 lambda connection: rows(connection, "UPDATE age SET age_s = ?, wall_s = ?", (mark.age_s, mark.wall_s))
             )
 
-    def audit(self, what: str, detail: str) -> None:
+    def audit(self, what: str, detail: str, *, client: str = "") -> None:
         """Note something that an administrator may have to look into; may be written later."""
-        log.warning("%s: %r", what, detail)
+        log.warning("%s: %r", what, detail, extra={"fields": {"client": client} if client else {}})
+        said = AuditText("server", what, detail, client)
         with suppress(UnreachableError):
-            self._writer.submit(lambda connection: write_audit(connection, "server", what, detail))
+            self._writer.submit(lambda connection: write_audit(connection, said))
 
     def close(self) -> None:
         """Finish what was accepted and close."""

@@ -9,19 +9,28 @@ from typing import Any
 import apsw
 
 from cairn_map.errors import ConflictError, UnreachableError
-from cairn_map.wire.access_messages import AuditEntry, audit_chain
+from cairn_map.wire.access_messages import AuditEntry, AuditText, audit_chain
 from cairn_server.store.known_tokens import KnownTokens, check_changed, token_row
 from cairn_server.store.sqlite.ended_tokens import EndedTokens
 from cairn_server.store.sqlite.readers import Readers
 from cairn_server.store.sqlite.writer import Writer, first, rows
 from cairn_server.store.store_age import StoreAge
-from cairn_server.store.store_rows import MapRow, Token, registration_name
+from cairn_server.store.store_rows import (
+    ALL_LINES,
+    AUDIT_COLUMNS,
+    AUDIT_ROWS_MAX,
+    NUMBER_LIMIT,
+    AuditChoice,
+    MapRow,
+    Token,
+    audit_entry,
+    registration_name,
+)
 
 log = logging.getLogger(__name__)
 
 USED_EVERY_S = 10.0
 """Time between two writes of all tokens' times of last use."""
-AUDIT_ROWS_MAX = 100_000
 _SELECT = (
     "SELECT t.name, t.role, t.map, m.name, t.robot, t.created_s, t.expires_s, t.last_used_s, t.created_age_s,"
     " t.used_age_s, t.confirmed"
@@ -153,30 +162,34 @@ class SqliteAuditLog:
         self._writer = writer
         self._readers = readers
 
-    def add(self, who: str, what: str, detail: str) -> None:
+    def add(self, who: str, what: str, detail: str, *, client: str = "") -> None:
         """One more line; durable on return."""
         log.info("%s: %s: %r", who, what, detail)
-        self._writer.run(lambda connection: write_audit(connection, who, what, detail))
+        said = AuditText(who, what, detail, client)
+        self._writer.run(lambda connection: write_audit(connection, said))
 
-    def page(self, *, after: int, limit: int) -> list[AuditEntry]:
-        """Lines numbered above `after`, oldest first."""
-        query = "SELECT number, time_s, who, what, detail, chain FROM audit WHERE number > ? ORDER BY number LIMIT ?"
+    def page(
+        self, *, limit: int, after: int = 0, before: int | None = None, choice: AuditChoice = ALL_LINES
+    ) -> list[AuditEntry]:
+        """Lines of a choice, oldest first, or with `before` newest first."""
+        conditions, values = choice.conditions("?")
+        where = " AND ".join(["number > ?", "number < ?", *conditions])
+        order = "number" if before is None else "number DESC"
+        query = f"SELECT {AUDIT_COLUMNS} FROM audit WHERE {where} ORDER BY {order} LIMIT ?"  # noqa: S608
+        limits = (after, NUMBER_LIMIT - 1 if before is None else before)
         with self._readers.reading() as reader:
-            found = rows(reader, query, (after, limit))
-        return [
-            AuditEntry(number=number, time_s=time_s, who=who, what=what, detail=detail, chain=chain.hex())
-            for number, time_s, who, what, detail, chain in found
-        ]
+            found = rows(reader, query, (*limits, *values, limit))
+        return [audit_entry(row) for row in found]
 
 
-def write_audit(connection: apsw.Connection, who: str, what: str, detail: str) -> None:
+def write_audit(connection: apsw.Connection, said: AuditText) -> None:
     """One more line of the audit log, chained to the last, inside a transaction; the newest lines are kept."""
     last, before = first(connection, "SELECT number, chain FROM audit ORDER BY number DESC LIMIT 1") or (0, b"")
     number, time_s = last + 1, time.time()
-    chain = audit_chain(before, number, time_s, who=who, what=what, detail=detail)
+    chain = audit_chain(before, number, time_s, said)
     connection.execute(
-        "INSERT INTO audit (number, time_s, who, what, detail, chain) VALUES (?, ?, ?, ?, ?, ?)",
-        (number, time_s, who, what, detail, chain),
+        "INSERT INTO audit (number, time_s, who, what, detail, chain, client) VALUES (?, ?, ?, ?, ?, ?, ?)",
+        (number, time_s, said.who, said.what, said.detail, chain, said.client),
     )
     connection.execute("DELETE FROM audit WHERE number <= ?", (number - AUDIT_ROWS_MAX,))
 

@@ -18,6 +18,7 @@ from collections import Counter
 from collections.abc import Hashable
 from contextlib import suppress
 from pathlib import Path
+from typing import IO
 
 from cairn_map.errors import BadInputError, UnreachableError
 from cairn_map.kernels.program import command_of
@@ -251,11 +252,20 @@ class CheckPool:
                 command_of("cairn_server.sync.checks.worker_nursery", [str(far.fileno()), str(self._memory_bytes)]),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
                 pass_fds=[far.fileno()],
                 start_new_session=True,
                 env={n: v for n, v in os.environ.items() if not n.startswith("CAIRN_")} | {"OPENBLAS_NUM_THREADS": "1"},
             )
+        threading.Thread(target=_log_lines, args=(self._nursery.stderr,), daemon=True).start()
         return self._control
+
+
+def _log_lines(stream: IO[bytes]) -> None:
+    """Log what a nursery and its workers write to standard error, until all are gone: the log has one form."""
+    with stream:
+        for line in stream:
+            log.warning("worker: %s", line.decode(errors="replace").rstrip())
 
 
 def _too_costly(what: str) -> BadInputError:
