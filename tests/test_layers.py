@@ -96,6 +96,7 @@ MAY_NAME = {
     "numba": [
         "cairn_map/*_kernels.py",
         "cairn_map/kernels/numba_runtime.py",
+        "cairn_map/kernels/kernel_cache.py",
         "cairn_fusion/*_kernels.py",
         "cairn_sim/*_kernels.py",
     ],

@@ -292,6 +292,7 @@ def test_commands_of_the_page_for_administrators_run(page: Page, monkeypatch: py
             "serve archive attic attic.cairn --data DIR": archive,
             "token create http://base:8750 field1 --role relay": create_relay,
             upstream: serve_field,
+            "serve --data TRIAL --port 8751": lambda: page.serve("trial", "--data", "TRIAL"),
         },
         before={"map robots admit http://HOST:8750/maps/lab mole": lose_a_disk},
     )

@@ -5,6 +5,7 @@ import subprocess
 import sys
 import tarfile
 import zipfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -53,22 +54,36 @@ def test_a_wheel_of_it_has_the_page_without_node(sources: Path, tmp_path: Path) 
         assert found.read("cairn_server/static/index.html") == (ROOT / STATIC / "index.html").read_bytes()
 
 
-def test_an_editable_install_without_the_page_says_how_to_build_it(sources: Path) -> None:
+@pytest.fixture
+def without_page(sources: Path) -> Iterator[Path]:
+    """The archive's sources as a fresh checkout has them: the page is not built."""
     (sources / STATIC).rename(sources / "gone")
+    yield sources
+    (sources / "gone").rename(sources / STATIC)
+
+
+def test_an_editable_install_builds_no_page(without_page: Path) -> None:
     hook = (
         "import sys; sys.path.insert(0, 'server/console'); import hatch_build; "
-        "hatch_build.ConsoleHook('.', {}, None, None, '', 'wheel').initialize('%s', {})"
+        "hatch_build.ConsoleHook('.', {}, None, None, '', 'wheel').initialize('editable', {})"
     )
+    _python(without_page, "-c", hook, **WITHOUT_NODE)
+    assert not (without_page / STATIC).exists()
+
+
+def test_a_checkout_installs_without_npm_and_its_page_says_how_to_get_it(without_page: Path, tmp_path: Path) -> None:
+    _hatchling(without_page, "build", "--target", "wheel", "--directory", str(tmp_path), **WITHOUT_NODE)
+    (wheel,) = tmp_path.glob("*.whl")
+    with zipfile.ZipFile(wheel) as found:
+        found.extractall(tmp_path / "installed")
     page = "from cairn_server.http.routes.console import ConsoleFiles; print(ConsoleFiles().page.plain.decode())"
-    folders = os.pathsep.join(str(sources / name) for name in ("fusion", "server"))
-    try:
-        _python(sources, "-c", hook % "editable", **WITHOUT_NODE)
-        assert not (sources / STATIC).exists()
-        assert "make console" in _python(sources, "-c", page, PYTHONPATH=folders)
-        with pytest.raises(AssertionError, match="the console was not built"):
-            _python(sources, "-c", hook % "standard", **WITHOUT_NODE)
-    finally:
-        (sources / "gone").rename(sources / STATIC)
+    said = _python(tmp_path, "-c", page, PYTHONPATH=str(tmp_path / "installed"))
+    assert "installed without this page" in said and "make console" in said
+
+
+def test_no_archive_is_made_without_the_page(without_page: Path, tmp_path: Path) -> None:
+    with pytest.raises(AssertionError, match="the console was not built"):
+        _hatchling(without_page, "build", "--target", "sdist", "--directory", str(tmp_path), **WITHOUT_NODE)
 
 
 def _hatchling(folder: Path, *arguments: str, **env: str) -> None:

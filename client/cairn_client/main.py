@@ -44,6 +44,10 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _run(point: EntryPoint, arguments: list[str]) -> int:
+    # Here and not above: it imports Numba, and the list of commands needs none.
+    from cairn_map.kernels.kernel_cache import home_folder, keep_kernels
+
+    keep_kernels(home_folder())
     try:
         module = import_module(point.module)
     except ModuleNotFoundError as exc:

@@ -4,7 +4,9 @@ The kernels are run through the public functions, because a kernel is compiled a
 read-only arrays, as decoding gives them, are another type than those that a robot made.
 """
 
-from collections.abc import Mapping
+import os
+import sys
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -18,7 +20,7 @@ from cairn_map.epochs.cell_reading import CellReading
 from cairn_map.epochs.epoch import BASE, Epoch
 from cairn_map.epochs.present import present
 from cairn_map.errors import BadInputError
-from cairn_map.evidence.brick_cell import brick_cell
+from cairn_map.evidence.brick_cell import brick_cell, reading_cell
 from cairn_map.evidence.channels import planes_and_squares
 from cairn_map.evidence.compact_cell import HeldCell
 from cairn_map.evidence.evidence import (
@@ -34,6 +36,7 @@ from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.fingerprint import fingerprint
 from cairn_map.evidence.grid import BRICK_DEPTH, CellKey, Geometry, cell_key, voxels_in_cell
 from cairn_map.evidence.inverse_sensor_model import SensorModel
+from cairn_map.kernels.numba_runtime import report_compiling
 from cairn_map.queries.frozen_map import FreezableMap
 from cairn_map.queries.map_snapshot import snapshot_of
 from cairn_map.render.camera_rays import look_at, pinhole
@@ -44,62 +47,111 @@ from cairn_map.render.pose_spread import PoseSpread
 from cairn_map.render.render_kernels import blend_into
 from cairn_map.render.render_picture import SCALES, Layer
 
+NICE = 10
+"""Niceness of the processes that share the warm-up: work that is being done comes first."""
+GEOMETRY = Geometry(depth=BRICK_DEPTH)
+
+
+@dataclass(frozen=True, slots=True)
+class _Voxels:
+    """Evidence of a few voxels: as a robot makes it, and as it is read, which are different types of arrays."""
+
+    made: list[Evidence]
+    """Many voxels; two with numbers as large as they may be; two with small ones."""
+    read: list[Evidence]
+
+    @property
+    def all(self) -> list[Evidence]:
+        return self.made + self.read
+
 
 def warm_up() -> None:
-    """Encode, decode, view, merge, take out again and fingerprint a few voxels, with numbers of every size."""
-    geometry = Geometry(depth=BRICK_DEPTH)
-    key = cell_key((0, 0, 0))
-    small, large = _many_voxels(geometry), _two_voxels(geometry, COUNT_MAX)
-    made = [small, large, _two_voxels(geometry, 1)]
-    modelled = decode_canonical_cell(encode_cell(key, small, geometry, profile=Profile.SMALL).data).evidence
-    read = [decode_canonical_cell(encode_cell(key, it, geometry).data).evidence for it in (modelled, *made[1:])]
-    for evidence in (*made, *read):
-        for held in (small, large):
-            cell = brick_cell(geometry, [held])
+    """Call every kernel of this package."""
+    for part in PARTS.values():
+        part()
+
+
+def warm_up_models() -> None:
+    """Encode and decode a few voxels by the models of profile small, and encode what was so read."""
+    modelled = decode_canonical_cell(encode_cell(_key(), _many_voxels(), GEOMETRY, profile=Profile.SMALL).data).evidence
+    encode_cell(_key(), modelled, GEOMETRY)
+    decode_view(encode_view(_key(), modelled, GEOMETRY, SensorModel()))
+
+
+def warm_up_codec() -> None:
+    """Encode a few voxels, and decode them as a whole and in parts, with numbers of every size."""
+    for evidence in _voxels().made:
+        reader = cell_reader(encode_cell(_key(), evidence, GEOMETRY).data)
+        _ = reader.octree().brick_count
+        for c in range(len(GEOMETRY.channels)):
+            reader.channel(c)
+        reader.bricks(0, 1)
+
+
+def warm_up_sums() -> None:
+    """Merge, take out again and fingerprint a few voxels."""
+    voxels = _voxels()
+    for evidence in voxels.all:
+        for held in voxels.made[:2]:
+            cell = brick_cell(GEOMETRY, [held])
             for change in (cell.merge, cell.unmerge):
                 with suppress(BadInputError):
                     change(evidence)
             cell.packed()
-        fingerprint(evidence, key)
-        row_fingerprint(evidence, Epoch(0), key, layer_word=0)
+        fingerprint(evidence, _key())
+        row_fingerprint(evidence, Epoch(0), _key(), layer_word=0)
         largest(evidence.counts, evidence.samples)
-        every_sum_has_weight(evidence.samples, geometry)
-        channel_above(evidence.samples, planes_and_squares(geometry.channels), 1)
-        voxels_in_cell(evidence.voxels, key, geometry)
-        present(cell_history({BASE: evidence}), geometry, SensorModel())
-    decode_view(encode_view(key, modelled, geometry, SensorModel()))
-    for evidence in made:
-        reader = cell_reader(encode_cell(key, evidence, geometry).data)
-        _ = reader.octree().brick_count
-        for c in range(len(geometry.channels)):
-            reader.channel(c)
-        reader.bricks(0, 1)
-    for evidence in (small, large):
-        whole = EvidenceMap(geometry)
-        whole.replace(key, evidence)
+        every_sum_has_weight(evidence.samples, GEOMETRY)
+        channel_above(evidence.samples, planes_and_squares(GEOMETRY.channels), 1)
+        voxels_in_cell(evidence.voxels, _key(), GEOMETRY)
+        for rows in ({BASE: evidence}, {BASE: evidence, Epoch(0): evidence}):
+            with suppress(BadInputError):
+                present(cell_history(rows), GEOMETRY, SensorModel())
+
+
+def warm_up_queries() -> None:
+    """Ask a map of one cell everything: one of sums, and one of readings."""
+    voxels = _voxels()
+    for evidence in voxels.made[:2]:
+        whole = EvidenceMap(GEOMETRY)
+        whole.replace(_key(), evidence)
         _ask(whole)
-    for evidence in (*made, *read):
-        _ask(_OneReading(evidence, geometry))
-    warm_up_pictures()
+    for evidence in voxels.all:
+        _ask(_OneReading(evidence, GEOMETRY))
 
 
 def warm_up_pictures() -> None:
-    """Draw a cell that was read, in every layer, as a server does."""
-    geometry, model, key = Geometry(depth=BRICK_DEPTH), SensorModel(), cell_key((0, 0, 0))
-    stored = encode_cell(key, _many_voxels(geometry), geometry).data
-    whole = brick_cell(geometry, [decode_canonical_cell(stored).evidence])
-    for layer in Layer:
-        _draw(key, read_cell(whole, geometry, model, layer), geometry, model, layer)
+    """Draw a cell that was read, in every layer, as a server does: one of sums, and one of a history."""
+    model = SensorModel()
+    read = decode_canonical_cell(encode_cell(_key(), _many_voxels(), GEOMETRY).data).evidence
+    reading = present(cell_history({BASE: read, Epoch(0): read}), GEOMETRY, model).evidence
+    for cell in (brick_cell(GEOMETRY, [read]), reading_cell(GEOMETRY, reading, model)):
+        for layer in Layer:
+            _draw(read_cell(cell, GEOMETRY, model, layer), model, layer)
 
 
-def _draw(key: CellKey, cell: ReadCell, geometry: Geometry, model: SensorModel, layer: Layer) -> None:
+SERVER_PARTS = {
+    "models": warm_up_models,
+    "codec": warm_up_codec,
+    "sums": warm_up_sums,
+    "pictures": warm_up_pictures,
+}
+"""Parts that a server needs, the longest first (19, 8, 7 and 5 s of a core), so that processes may share them."""
+SERVER_KERNELS = 64
+"""Kernels that these parts compile, not counting those that others call."""
+CHECK_PARTS = ("models", "codec", "sums")
+"""Those of them that a check of commits needs."""
+PARTS = SERVER_PARTS | {"queries": warm_up_queries}
+
+
+def _draw(cell: ReadCell, model: SensorModel, layer: Layer) -> None:
     renderer = MapRenderer()
     drawing = draw_as_needed(
         renderer,
-        geometry,
+        GEOMETRY,
         model,
         {},
-        [key],
+        [_key()],
         lambda keys: dict.fromkeys(keys, cell),
         sight=pinhole(4, 4, focal_px=4),
         T_map_camera=look_at((-1, 0.1, 0.1), (0, 0, 0)),
@@ -126,7 +178,7 @@ class _OneReading:
             grown = self.evidence.where(np.arange(len(self.evidence)) < 1)
             row.merge(grown)
             reading.note(Epoch(0), grown, 1)
-        return {cell_key((0, 0, 0)): reading.cell()}
+        return {_key(): reading.cell()}
 
     def frozen_times(self) -> None:
         return None
@@ -149,17 +201,47 @@ def _ask(whole: FreezableMap) -> None:
     blend_into(np.zeros((1, 3), np.uint8), np.zeros((1, 4), np.uint8), np.zeros((1, 3), np.uint8))
 
 
-def _many_voxels(geometry: Geometry) -> Evidence:
+def _key() -> CellKey:
+    # Not when the module is imported: it calls a kernel.
+    return cell_key((0, 0, 0))
+
+
+def _voxels() -> _Voxels:
+    made = [_many_voxels(), _two_voxels(COUNT_MAX), _two_voxels(1)]
+    return _Voxels(made, [decode_canonical_cell(encode_cell(_key(), it, GEOMETRY).data).evidence for it in made])
+
+
+def _many_voxels() -> Evidence:
     """As many as make models pay: profile small falls back to the fast one otherwise."""
     places = np.arange(0, 512, 3, dtype=np.uint32)
     noise = (places * np.uint32(2654435761)) >> np.uint32(20)
     counts = np.stack([places % 2, noise % 5], axis=1).astype(np.int32)
-    samples = np.where(places[:, None] % 2 == 1, np.ones(geometry.plane_count, np.int64), 0)
-    return packed_evidence(places, counts, samples, geometry)
+    samples = np.where(places[:, None] % 2 == 1, np.ones(GEOMETRY.plane_count, np.int64), 0)
+    return packed_evidence(places, counts, samples, GEOMETRY)
 
 
-def _two_voxels(geometry: Geometry, count: int) -> Evidence:
+def _two_voxels(count: int) -> Evidence:
     """A count, and sums as large as they may be."""
     counts = np.array([[0, 1], [count, 0]])
-    samples = np.array([[0] * geometry.plane_count, [SUM_MAX] * geometry.plane_count], np.int64)
-    return packed_evidence(np.array([0, 511], np.uint32), counts, samples, geometry)
+    samples = np.array([[0] * GEOMETRY.plane_count, [SUM_MAX] * GEOMETRY.plane_count], np.int64)
+    return packed_evidence(np.array([0, 511], np.uint32), counts, samples, GEOMETRY)
+
+
+def _say(kernel: str) -> None:
+    sys.stdout.write(f"{kernel}\n")
+    sys.stdout.flush()
+
+
+def main(names: Sequence[str]) -> None:
+    """Call the parts of these names that standard input says, each by a byte, and print each kernel to be compiled.
+
+    Any number of processes read the same pipe: each takes a part when it has done with the one before.
+    """
+    os.nice(NICE)
+    report_compiling(_say)
+    while number := os.read(sys.stdin.fileno(), 1):
+        PARTS[names[number[0]]]()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

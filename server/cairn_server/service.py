@@ -12,6 +12,7 @@ many threads.
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import chain
 
@@ -102,8 +103,18 @@ class ViewParts:
 class Service:
     """Parts of a map server on one store, made and ended together."""
 
-    def __init__(self, store: Store, settings: Settings, *, fold_process: FoldProcess | None = None) -> None:
-        """Start the parts; without `fold_process` the service's own thread folds, if it is to fold at all."""
+    def __init__(
+        self,
+        store: Store,
+        settings: Settings,
+        *,
+        fold_process: FoldProcess | None = None,
+        warming: Callable[[], str | None] = lambda: None,
+    ) -> None:
+        """Start the parts; without `fold_process` a thread folds, if the service is to fold at all.
+
+        It is not ready until `warming` is None: what the start still waits for.
+        """
         self.store = store
         self.settings = settings
         self.certificate = certificate_of(settings)
@@ -151,19 +162,11 @@ class Service:
                 process=fold_process,
                 memory=FoldMemory.of_server(settings.memory, settings.folder),
             )
-        self.readiness = Readiness(store.health, folds, settings, self._is_folding)
+        self.readiness = Readiness(store.health, folds, settings, self._is_folding, warming)
         self.cells = Cells(store, damaged, on_heal=self._wake_folding)
 
         self.sync = self._sync_parts(upstream)
-        exports = MapExports(store, self.cells)
-        self.views = ViewParts(
-            CellViews(store, self.cells),
-            MapViews(store, self.cells, cache_share=settings.memory.cache_share),
-            exports,
-            ExportTickets(store, self.holders, exports),
-            MapChangesSearch(store, self.cells),
-            HottestSearch(store, self.cells),
-        )
+        self.views = self._view_parts()
 
     def _sync_parts(self, upstream: UpstreamProgress) -> SyncParts:
         store, settings, wanted = self.store, self.settings, WantedCommits()
@@ -190,6 +193,17 @@ class Service:
             ),
             HeldCommits(store, wanted),
             upstream,
+        )
+
+    def _view_parts(self) -> ViewParts:
+        exports = MapExports(self.store, self.cells)
+        return ViewParts(
+            CellViews(self.store, self.cells),
+            MapViews(self.store, self.cells, cache_share=self.settings.memory.cache_share),
+            exports,
+            ExportTickets(self.store, self.holders, exports),
+            MapChangesSearch(self.store, self.cells),
+            HottestSearch(self.store, self.cells),
         )
 
     def _folded(self, row: MapRow) -> None:

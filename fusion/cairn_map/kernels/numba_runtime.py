@@ -8,7 +8,7 @@ the kernel is done; in a log it is a line every few seconds. Kernels that are re
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
@@ -52,7 +52,18 @@ class CompileProgress:
 
 @cache
 def show_compiling() -> None:
-    """Show on standard error, from now on, which kernel is being compiled; a second call does nothing.
+    """Show on standard error, from now on, which kernel is being compiled; a second call does nothing."""
+    progress = CompileProgress()
+
+    def begin(kernel: str) -> None:
+        kernels = list(known_kernels())
+        progress.begin(kernel, ready=sum(bool(kernel.signatures) for kernel in kernels), total=len(kernels))
+
+    report_compiling(begin, progress.end)
+
+
+def report_compiling(on_begin: Callable[[str], None], on_end: Callable[[float], None] = lambda seconds: None) -> None:
+    """Call with the name of each kernel that is being compiled, from now on, and with the seconds that it took.
 
     Numba is imported here and not above, so that commands without kernels start without it.
     """
@@ -62,21 +73,18 @@ def show_compiling() -> None:
         """Listener to every compilation, in any thread; a kernel that another one calls is compiled within that one."""
 
         def __init__(self) -> None:
-            self.progress = CompileProgress()
             self.starts_s: list[float] = []
 
         def on_start(self, event: Event) -> None:
             self.starts_s.append(time.monotonic())
             if len(self.starts_s) == 1:
-                kernels = list(known_kernels())
-                ready = sum(bool(kernel.signatures) for kernel in kernels)
                 details: Any = event.data
-                self.progress.begin(details["dispatcher"].py_func.__name__, ready=ready, total=len(kernels))
+                on_begin(details["dispatcher"].py_func.__name__)
 
         def on_end(self, event: Event) -> None:
             start_s = self.starts_s.pop()
             if not self.starts_s:
-                self.progress.end(time.monotonic() - start_s)
+                on_end(time.monotonic() - start_s)
 
     register("numba:compile", Compiling())  # type: ignore[no-untyped-call]
 
@@ -85,8 +93,9 @@ def known_kernels() -> "Iterator[Dispatcher]":
     """Every kernel of a `*_kernels` module that was imported and that Numba keeps on disk, once."""
     from numba.core.dispatcher import Dispatcher
 
-    names = [name for name in sys.modules if name.startswith("cairn_") and name.endswith("_kernels")]
-    values = {id(value): value for name in names for value in vars(sys.modules[name]).values()}
+    # Copies: other threads may import modules meanwhile.
+    names = [name for name in list(sys.modules) if name.startswith("cairn_") and name.endswith("_kernels")]
+    values = {id(value): value for name in names for value in list(vars(sys.modules[name]).values())}
     for value in values.values():
         if isinstance(value, Dispatcher) and value.stats.cache_path is not None:
             yield value

@@ -74,13 +74,19 @@ class Readiness:
     """Reasons why the server is not ready, looked up at most every second; thread-safe."""
 
     def __init__(
-        self, store: StoreHealth, folds: FoldHealth, settings: Settings, is_folding: Callable[[], bool]
+        self,
+        store: StoreHealth,
+        folds: FoldHealth,
+        settings: Settings,
+        is_folding: Callable[[], bool],
+        warming: Callable[[], str | None],
     ) -> None:
-        """`is_folding` is True while the thread that folds is alive."""
+        """`is_folding` is True while the thread that folds is alive; `warming` is what the start still waits for."""
         self._store = store
         self._folds = folds
         self._settings = settings
         self._is_folding = is_folding
+        self._warming = warming
         self._lock = threading.Lock()
         self._looked_s = float("-inf")
         self._reasons: list[str] = []
@@ -130,6 +136,9 @@ class Readiness:
         complaint = self._folds.complaint()
         if complaint:
             found.append(f"fold_failing: {complaint}")
+        warming = self._warming()
+        if warming:
+            found.append(warming)
         return found
 
     def _check_space(self) -> None:

@@ -57,6 +57,7 @@ import uvicorn
 from fastapi import FastAPI
 
 from cairn_map.errors import BadInputError
+from cairn_map.kernels.kernel_cache import keep_kernels
 from cairn_server.access.turns import Turns
 from cairn_server.folding.fold_memory import FoldMemory
 from cairn_server.folding.fold_process import fork_folding
@@ -75,6 +76,7 @@ from cairn_server.operations.reload import Reload
 from cairn_server.operations.serve_options import serve_parser, settings_of
 from cairn_server.operations.store_opening import opened, settling, store_of
 from cairn_server.operations.upstream import joined
+from cairn_server.operations.warm_start import WarmStart
 from cairn_server.service import Service
 from cairn_server.settings import LOOPBACK, Settings
 from cairn_server.store.folder_lock import lock_folder, tell_port
@@ -99,6 +101,8 @@ OTHER_DESCRIPTORS = 300
 """Descriptors besides those of connections: three for each thread that reads the store, workers, exports, and the
 connections that are accepted in one turn of the event loop before those that give way are closed."""
 STRANGERS_SHARE = 4
+KERNELS = "kernels"
+"""Folder next to the store for compiled kernels, where those next to the code cannot be written; may be deleted."""
 COMMANDS: dict[str, Callable[[list[str]], int]] = {
     "backup": back_up_command,
     "restore": restore_command,
@@ -126,6 +130,7 @@ def main(argv: list[str]) -> int:
         signal.SIGHUP, signal.SIG_IGN
     )  # until there is something to reload; what is forked ignores it for good
     sys.setswitchinterval(SWITCH_S)
+    keep_kernels(settings.folder / KERNELS)
     # Forked before there are threads: a lock that another thread held at the fork would stay locked in the child.
     open_store, reads_of = store_of(settings)
     folding = None
@@ -135,8 +140,11 @@ def main(argv: list[str]) -> int:
     keep_memory_small()
     with Life() as life, _folder_of(settings), listen(settings.host, settings.port) as listener:
         try:
-            service = Service(opened(open_store, settings), settings, fold_process=folding)
-            with closing(service), _views_of(service), settling(service), joined(service) as relay:
+            warm_start = WarmStart()
+            service = Service(
+                opened(open_store, settings), settings, fold_process=folding, warming=warm_start.complaint
+            )
+            with closing(service), _views_of(service), settling(service), joined(service) as relay, warm_start:
                 Reload(service, lambda: settings_of(args), relay).at_signal()
                 _serve(service, listener, long_bodies, life)
         finally:

@@ -13,10 +13,16 @@ from importlib import import_module
 from pathlib import Path
 
 from cairn_client.cli.compile import main
+from cairn_map.kernels.numba_runtime import known_kernels
+from cairn_map.warm_up import SERVER_KERNELS, SERVER_PARTS
 from numba.core.caching import NullCache
 from numba.core.dispatcher import Dispatcher
 from numba.core.types import BaseNamedTuple
 
+for part in SERVER_PARTS.values():
+    part()
+if (count := sum(bool(kernel.signatures) for kernel in known_kernels())) != SERVER_KERNELS:
+    sys.exit(f"a server calls {count} kernels, not {SERVER_KERNELS} (SERVER_KERNELS)")
 main([])
 for package in ("cairn_map", "cairn_fusion", "cairn_sim"):
     folder = Path(import_module(package).__file__).parent

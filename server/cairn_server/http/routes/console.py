@@ -27,10 +27,10 @@ MEDIA_TYPES = {
     ".svg": "image/svg+xml",
 }
 NOT_BUILT = """<!doctype html><html lang="en"><meta charset="utf-8"><title>cairn</title><h1>cairn map server</h1>
-<p>It runs, but its console is not built. In the folder with cairn's sources, where npm's packages can be had:</p>
-<pre>make console</pre>
-<p>and start the server again. Until then: <a href="maps">maps</a>, <a href="docs">routes</a>;
-<code>cairn map ls</code> lists the maps in a terminal.</p></html>"""
+<p>It runs, but it was installed without this page: where npm's registry can be reached, run <code>make console</code>
+in the folder with cairn's sources, install from there again, and start the server again.</p>
+<p>All else is there: <a href="maps">maps</a>, <a href="docs">routes</a>; <code>cairn map ls</code> lists the maps in a
+terminal.</p></html>"""
 
 SECURITY = {
     "Content-Security-Policy": (

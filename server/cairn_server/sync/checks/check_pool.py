@@ -12,7 +12,6 @@ import queue
 import signal
 import socket
 import subprocess
-import sys
 import threading
 import time
 from collections import Counter
@@ -22,6 +21,7 @@ from pathlib import Path
 from typing import IO
 
 from cairn_map.errors import BadInputError, UnreachableError
+from cairn_map.kernels.program import command_of
 from cairn_server.processes import LENGTH, received, send
 from cairn_server.sync.checks.checking import Checked
 from cairn_server.sync.checks.worker_nursery import checked_from
@@ -247,16 +247,9 @@ class CheckPool:
         self._control, far = socket.socketpair()
         with far:
             # It gets nothing of the server's: no CAIRN_ variable, for there are secrets in them; no terminal's Ctrl-C;
-            # and with -P no module from the folder that the server was started in.
+            # and by `command_of` no module from the folder that the server was started in.
             self._nursery = subprocess.Popen(  # noqa: S603 - our own program, and two numbers
-                [
-                    sys.executable,
-                    "-P",
-                    "-m",
-                    "cairn_server.sync.checks.worker_nursery",
-                    str(far.fileno()),
-                    str(self._memory_bytes),
-                ],
+                command_of("cairn_server.sync.checks.worker_nursery", [str(far.fileno()), str(self._memory_bytes)]),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.PIPE,

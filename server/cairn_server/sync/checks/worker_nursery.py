@@ -21,7 +21,7 @@ from pathlib import Path
 
 from cairn_map.commits.commit_reading import commit_reader
 from cairn_map.errors import BadInputError, CairnError, DamagedDataError
-from cairn_map.warm_up import warm_up
+from cairn_map.warm_up import CHECK_PARTS, SERVER_PARTS
 from cairn_server.processes import LENGTH, die_with_parent, received, send
 from cairn_server.sync.checks.checking import Checked, check_commit
 
@@ -35,7 +35,8 @@ def main(control_fd: int, memory_bytes: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # the kernel buries workers
-    warm_up()
+    for part in CHECK_PARTS:
+        SERVER_PARTS[part]()
     with socket.socket(fileno=control_fd) as control:
         while True:
             message, fds, _, _ = socket.recv_fds(control, 1, 1)

@@ -1,0 +1,107 @@
+"""The server under a service user without a home, from code that is read-only: it starts, and is ready when it is warm.
+
+The code is a copy that no user may write to, with the kernels of `cairn compile` or without any; where the tests run as
+root, the server runs without a capability, so that modes count for it as for any user.
+"""
+
+import os
+import re
+import shutil
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from tests.fixtures.server.live import Process, until
+from tests.fixtures.server.processes import all_folded, children_of, client, make_map
+from tests.fixtures.server.pushes import KEYS, pushed
+from tests.fixtures.sources import FOLDERS, ROOT
+
+from cairn_map.evidence.grid import cell_of_key
+
+pytestmark = pytest.mark.processes
+
+DROPPED = ("setpriv", "--inh-caps=-all", "--bounding-set=-all", "--no-new-privs")
+
+
+class Service:
+    """What a service user has: a data folder, and code."""
+
+    def __init__(self, place: Path, *, kernels: bool) -> None:
+        """Copy the code, with the kernels that lie next to it or without any."""
+        self.data = place / "data"
+        self.data.mkdir()
+        self._code = place / "code"
+        left_out = ["static", *(() if kernels else ("*.nbi", "*.nbc", "cairn_*-*"))]
+        for package, folder in FOLDERS.items():
+            shutil.copytree(ROOT / folder / package, self._code / package, ignore=shutil.ignore_patterns(*left_out))
+        for path in (self._code, *self._code.rglob("*")):
+            path.chmod(0o555 if path.is_dir() else 0o444)
+
+    @property
+    def under(self) -> tuple[str, ...]:
+        return (*(DROPPED if os.geteuid() == 0 else ()), "env", "HOME=/nonexistent", f"PYTHONPATH={self._code}")
+
+    def start(self) -> Process:
+        return Process(self.data, under=self.under)
+
+    def close(self) -> None:
+        for path in (self._code, *self._code.rglob("*")):
+            if path.is_dir():
+                path.chmod(0o755)
+
+
+@pytest.fixture
+def service(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Service]:
+    if os.geteuid() == 0 and shutil.which(DROPPED[0]) is None:
+        pytest.skip("setpriv is missing")
+    service = Service(tmp_path, kernels=request.param)
+    yield service
+    service.close()
+
+
+@pytest.mark.parametrize("service", [False], indirect=True)
+def test_it_lives_at_once_and_compiles_into_the_data_folder_before_it_is_ready(service: Service) -> None:
+    process = service.start()
+    with client(process) as http:
+        assert http.get("/healthz").status_code == 200
+        answer = http.get("/readyz")
+        assert answer.status_code == 503
+        assert re.fullmatch(r"compiling: \d+ of \d+, \d+ s", answer.json()["detail"])
+        until(lambda: bool(list((service.data / "kernels").rglob("*.nbc"))), "a kernel is kept")
+    children = children_of(process.pid)
+    process.send(signal.SIGTERM)
+    code, said = process.end()
+    assert code == 0 and "compiling kernels, once for this version: 0 of " in said and "Traceback" not in said, said
+    assert not [child for child in children if Path(f"/proc/{child}").exists()]
+
+
+@pytest.mark.parametrize("service", [True], indirect=True)
+def test_kernels_next_to_read_only_code_are_all_that_it_needs(service: Service) -> None:
+    process = service.start()
+    with client(process) as http:
+        assert http.get("/readyz").status_code == 200
+        make_map(http)
+        commit = pushed(0, 0)
+        http.put(f"/maps/lab/commits/{commit.id}", content=commit.data).raise_for_status()
+        all_folded(http)
+        main = "/maps/lab/main"
+        for asked in (f"cells/{cell_of_key(KEYS[0])}.view", "render?x=0&y=0&z=0", "export?format=ply"):
+            http.get(f"{main}/{asked}").raise_for_status()
+    process.send(signal.SIGTERM)
+    assert process.end() == (0, "")
+    assert not (service.data / "kernels").exists(), "something was compiled"
+
+
+@pytest.mark.parametrize("service", [False], indirect=True)
+def test_without_a_folder_for_kernels_it_goes_on_and_says_so_in_one_line(service: Service) -> None:
+    (service.data / "kernels").write_text("a file, where a folder should be")
+    process = service.start()
+    with client(process) as http:
+        assert http.get("/readyz").status_code == 200
+        make_map(http)
+    process.send(signal.SIGTERM)
+    code, said = process.end()
+    assert code == 0
+    (line,) = (line for line in said.splitlines() if "kernels" in line and "compiling kernels, only once" not in line)
+    assert line.endswith("no folder takes compiled kernels: each process compiles its own, and first requests wait")
