@@ -40,7 +40,7 @@ def test_a_map_is_deleted_by_a_request_that_names_it_twice(guarded: Live) -> Non
     again = guarded.http.delete(f"/maps/{row.name}", params={"confirm": row.name}, headers=bearer(ADMIN))
     assert (again.status_code, kind_of(again)) == (410, "gone")
     lines = [line for line in guarded.service.store.audit_log.page(after=0, limit=1000) if line.what == "delete_map"]
-    assert (lines[-1].who, lines[-1].detail.partition(":")[0]) == ("admin", row.name)
+    assert (lines[-1].who, lines[-1].detail.partition(":")[0]) == ("admin", f"map {row.name}")
 
 
 @pytest.mark.parametrize("has_namesake", [False, True])
