@@ -147,6 +147,7 @@ def test_no_control_character_of_a_server_reaches_the_terminal(
         "branches": [robot | unknown | {"sensors": [STRANGE_TEXT], "status": status}],
         "keys": {"admitted": [key], "asking": [asking]},
         "log": [entry | {"captured_s": None, "via": STRANGE_TEXT, "retracts": []}],
+        "sizes": guarded.http.get(f"/maps/{THERE}/sizes", headers=bearer(ADMIN)).json(),
         THERE: info,
     }
 
