@@ -120,7 +120,8 @@ class OpenSockets:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._sockets: weakref.WeakSet[socket.socket] = weakref.WeakSet()
-        self._is_cut = False
+        self.is_cut = False
+        """True while nothing is to be sent."""
         self.certificate_end_s: float | None = None
         """End of the certificate that the server showed last, UTC seconds since 1970; None: it showed none."""
 
@@ -135,7 +136,7 @@ class OpenSockets:
 
     def cut(self) -> None:
         """End all that is under way, and let nothing begin until `mend`; by any thread."""
-        self._is_cut = True
+        self.is_cut = True
         self.break_off()
 
     def break_off(self) -> None:
@@ -148,7 +149,7 @@ class OpenSockets:
 
     def mend(self) -> None:
         """Requests may be sent again; each makes a connection of its own if it must."""
-        self._is_cut = False
+        self.is_cut = False
 
     def _trace(self, name: str, info: Mapping[str, Any]) -> None:
         if name in OPENED:
@@ -160,7 +161,7 @@ class OpenSockets:
             self._check()
 
     def _check(self) -> None:
-        if self._is_cut:
+        if self.is_cut:
             raise UnreachableError("interrupted", "the robot is being closed")
 
 
@@ -543,7 +544,7 @@ class MapApi:
                 yield response, deadline
         except httpx.TransportError as exc:
             deadline.check()
-            is_connected = not isinstance(exc, httpx.ConnectError | httpx.TimeoutException)
+            is_connected = not (self.sockets.is_cut or isinstance(exc, httpx.ConnectError | httpx.TimeoutException))
             if is_connected and not self._was_answered and self._is_for_tls():
                 raise other_scheme(self._shown_url) from exc
             raise unreachable(exc, self._shown_url) from exc

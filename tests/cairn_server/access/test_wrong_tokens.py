@@ -46,6 +46,7 @@ def test_a_wrong_token_is_told_with_its_address_and_without_itself(
         assert live.http.post("/maps/lab/retracts", headers=WRONG, content=b"{}").status_code == 401
         assert live.http.get("/maps").status_code == 401  # no token at all is a page that is opened
         assert live.http.get("/healthz").status_code == 200
+        live.service.store.audit_log.add("test", "mark", "the lines before are written")
         lines = live.http.get("/audit", params={"what": "bad_token"}, headers=ADMIN).json()
         chained = live.service.store.audit_log.page(limit=9)
     assert [(line["who"], line["client"], line["detail"]) for line in lines] == [
@@ -60,5 +61,6 @@ def test_many_wrong_tokens_are_few_lines(tmp_path: Path, monkeypatch: pytest.Mon
     with Live(tmp_path, admin_token="a" * 20) as live:
         for _ in range(9):
             live.http.get("/maps", headers=WRONG)
+        live.service.store.audit_log.add("test", "mark", "the lines before are written")
         lines = live.http.get("/audit", params={"what": "bad_token"}, headers=ADMIN).json()
     assert len(lines) == 2

@@ -159,11 +159,14 @@ class HeadRequests:
             if message.get("more_body", False):
                 raise _HeadSentError
 
-        # In place, and put back: those around share the scope, and note in it which route was found.
+        # In place, and put back: those around share the scope, and note in it which route was found. A part of a body
+        # is asked for by GET alone (RFC 9110, 14.2).
+        headers = scope["headers"]
         scope["method"] = "GET"
+        scope["headers"] = [field for field in headers if field[0] != b"range"]
         try:
             await self._app(scope, receive, send_head)
         except _HeadSentError:
             pass
         finally:
-            scope["method"] = "HEAD"
+            scope["method"], scope["headers"] = "HEAD", headers
