@@ -76,6 +76,7 @@ def soak(
     token = secrets.token_urlsafe(32)
     secret = folder / "admin"
     secret.write_text(token)
+    secret.chmod(0o600)
     options = "--admin-token-file", str(secret)
     with _serving(folder, servers, *options) as site, MapApi(site.urls[0], token=token) as api:
         api.create_map(MAP, CreateMap(geometry=seen_by.geometry))

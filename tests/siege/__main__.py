@@ -116,6 +116,7 @@ def _told(waits: Waits, kind: str) -> str:
 def _fortress(folder: Path, *, is_secure: bool) -> Iterator[Fortress]:
     for name, secret in (("admin", ADMIN), ("enroller", ENROLLER)):
         (folder / name).write_text(secret)
+        (folder / name).chmod(0o600)
     arguments = ["--admin-token-file", str(folder / "admin"), "--enrolment-token-file", str(folder / "enroller")]
     verify: str | bool = True
     if is_secure:

@@ -74,7 +74,7 @@ def test_with_the_old_folder_what_ended_stays_so_and_the_losses_are_counted(
 ) -> None:
     said = restored(tmp_path, "--old", tmp_path / "old")
     assert "2 count at once, 4 ended since the backup" in said
-    assert f"not in the backup: 1 commits, 4 audit lines, 2 tokens of {tmp_path / 'old'}" in said
+    assert f"not in the backup: 1 commits, 8 audit lines, 2 tokens of {tmp_path / 'old'}" in said
     with serving(tmp_path / "new") as (live, admin):
         assert worth(live, history) == dict.fromkeys(history, "good") | dict.fromkeys(ENDED, "bad_token")
         admin.revoke_token("desk")
