@@ -14,7 +14,8 @@ each axis, so a point on a border is in the upper one. NaN, infinity or a point 
 map frame, sides may be infinite: it holds the voxels whose centres it holds; without one, the whole map is meant.
 Lengths are metres, temperatures kelvin (apparent), colours sRGB 0 to 255. Evidence is read under the snapshot's
 `SensorModel`: probabilities are clamped, and a voxel without hits and misses is unknown. Of a map with epochs, what was
-seen later outweighs what was seen before, and colours and temperatures are the newest; `seen_at` has their age.
+seen later outweighs what was seen before, and colours and temperatures are the newest; `seen_at` has the time at which
+a voxel was seen last, perhaps by a camera without colour or temperature.
 """
 
 from typing import Self

@@ -102,7 +102,7 @@ def test_an_exception_is_told_in_either_form() -> None:
 
 
 @pytest.mark.processes
-def test_every_line_is_json_from_the_first_to_the_last(tmp_path: Path) -> None:
+def test_every_line_is_json_from_the_first_to_the_last(tmp_path: Path, request: pytest.FixtureRequest) -> None:
     (tmp_path / "admin").write_text(ADMIN)
     (tmp_path / "admin").chmod(0o600)
     options = ("--admin-token-file", str(tmp_path / "admin"), "--log-format", "json")
@@ -112,6 +112,7 @@ def test_every_line_is_json_from_the_first_to_the_last(tmp_path: Path) -> None:
         stderr=subprocess.STDOUT,
         text=True,
     )
+    request.addfinalizer(first.kill)
     assert first.stdout is not None
     announced, started = (json.loads(first.stdout.readline()) for _ in range(2))
     assert "is new, and so is the store" in announced["message"]

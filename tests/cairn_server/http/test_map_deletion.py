@@ -1,4 +1,4 @@
-"""What is answered of a map that was deleted: `gone` to its own tokens and to those of all maps, nothing to others."""
+"""Answers about a map that was deleted: `gone` to its own tokens and to those of all maps, nothing to others."""
 
 from collections.abc import Iterator
 

@@ -25,7 +25,7 @@ DROPPED = ("setpriv", "--inh-caps=-all", "--bounding-set=-all", "--no-new-privs"
 
 
 class Service:
-    """What a service user has: a data folder, and code."""
+    """Folders of a service user: one for data, and the code."""
 
     def __init__(self, place: Path, *, kernels: bool) -> None:
         """Copy the code, with the kernels that lie next to it or without any."""

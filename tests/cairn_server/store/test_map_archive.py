@@ -63,7 +63,7 @@ def tables_of(folder: Path, name: str) -> dict[str, list[tuple[Any, ...]]]:
 
 
 def answers(live: Live, row: MapRow) -> Any:
-    """What clients are told of a map."""
+    """Facts of a map as clients are told them."""
     path = f"/maps/{row.name}"
     log = live.http.get(f"{path}/log", params={"limit": 1000}).json()
     commits = [live.http.get(f"{path}/commits/{entry['id']}") for entry in log]
