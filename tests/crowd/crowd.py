@@ -106,6 +106,7 @@ class CrowdRobot:
         request = {
             "author": f"{self.name}.{INCARNATION}",
             "cursor": self.cursor,
+            "since": "cursor" if self.cursor else None,
             "kinds": ["delta", "state", "full"],
         }
         start_s = time.perf_counter()

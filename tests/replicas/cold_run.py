@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import httpx
+from tests.fixtures.server.deadline import until
 from tests.fixtures.server.object_store import ObjectServer, object_server_in
 from tests.fixtures.server.postgres import PostgresServer
 from tests.replicas.fault_run import FaultRun, faults_of, postgres_in, push_under_faults
@@ -28,6 +29,8 @@ AT_ONCE = "settle_cells_s = 0\nsettle_evidence_s = 0\nobjects_grace_s = 3\n"
 """Settings under which everything moves as soon as it is folded, and dead objects are deleted after 3 s: longer than
 a reader takes."""
 READ_PAUSE_S = 0.02
+READ_LEAST = 50
+"""Cells that are read in a run, however slow the machine is."""
 EXPECTED = (200, 404, 503)
 """Statuses that a reader of a cell may get: it may not be there yet, or be away."""
 COLD = """
@@ -49,6 +52,9 @@ def cold_run(folder: Path, programs: Path, *, seconds: float, robots: int, seed:
         chance.shuffle(faults)
         with _reading(site, found):
             push_under_faults(site, found, faults, chance, seconds=seconds, robots=robots, objects=bucket)
+            until(lambda: found.reads["200"] >= READ_LEAST, "cells are read")
+        # What failed while the object store was away is tried again, after a growing pause.
+        until(lambda: min(_cold(postgres)[what] for what in ("cells", "segments")) > 0, "cells and evidence move there")
         found.cold = _cold(postgres)
         site.close()
     return found

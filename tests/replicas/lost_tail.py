@@ -57,7 +57,12 @@ class LostTails:
     @property
     def is_sound(self) -> bool:
         """True if nothing was lost, and nothing of a lost history was sent."""
-        return not (self.misfits or self.wrong) and self.silence_s < SILENCE_MAX_S
+        return not (self.misfits or self.wrong)
+
+    @property
+    def is_timely(self) -> bool:
+        """True if robots did not wait for long."""
+        return self.silence_s <= SILENCE_MAX_S
 
     def rows(self) -> Iterator[tuple[str, str]]:
         """Lines for people."""

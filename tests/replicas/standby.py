@@ -47,8 +47,12 @@ class Failover:
     @property
     def is_sound(self) -> bool:
         """True if no robot met a standby, and nothing was lost."""
-        is_right = not (self.resets or self.older or self.misfits or self.wrong)
-        return is_right and self.resumed_s < SILENCE_MAX_S
+        return not (self.resets or self.older or self.misfits or self.wrong)
+
+    @property
+    def is_timely(self) -> bool:
+        """True if robots did not wait for long."""
+        return self.resumed_s <= SILENCE_MAX_S
 
     def rows(self) -> Iterator[tuple[str, str]]:
         """Lines for people."""

@@ -12,10 +12,10 @@ state asks first whether it is still in the log.
 
 import threading
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Protocol
 
-from cairn_map.commits.cursor import ENTRY_FOLD, Cursor
+from cairn_map.commits.cursor import ENTRY_FOLD, Cursor, first_chain
 from cairn_map.commits.ids import CommitId
 from cairn_map.commits.version_vector import EMPTY, VersionVector
 from cairn_server.store.store import Snapshot
@@ -90,6 +90,20 @@ def vector_in(log: MarkedLog, seq: int, known: tuple[int, VersionVector] = (0, E
     mark_seq = log.newest_mark(seq)
     at, vector = (mark_seq, log.mark(mark_seq)) if mark_seq > known[0] else known
     return vector.with_commits(folded_ids(log, after_seq=at, to_seq=seq))
+
+
+class ReadChains:
+    """Chains at entries of the log in one snapshot, each read once: a reply asks for it with every changed cell."""
+
+    def __init__(self, head: Cursor, layer_digest: bytes) -> None:
+        self._known = {head.seq: head.chain, 0: first_chain(head.log_id, layer_digest)}
+
+    def get(self, seq: int, read: Callable[[], bytes | None]) -> bytes | None:
+        """The chain after entry `seq` (0: of the empty log), by `read` the first time; None: there is no such entry."""
+        chain = self._known.get(seq)
+        if chain is None and (chain := read()) is not None:
+            self._known[seq] = chain
+        return chain
 
 
 class KnownVectors:

@@ -22,6 +22,7 @@ from cairn_server.store.store_rows import MapRow
 from cairn_server.sync.asked_cells import Asked
 from cairn_server.sync.held_commits import WantedCommits
 from cairn_server.sync.missing import CellFrames, HeaderFacts, header_of, proven_since, query_of, reply_frames
+from cairn_server.sync.slices import SLICES_HERE, SLICES_THERE, Slices
 
 
 class StableVectors:
@@ -59,6 +60,7 @@ class MainReplies:
         self._figures = figures
         self._stable = stable
         self._cache = ReadCache(share=cache_share)
+        self._slices = Slices(SLICES_HERE if store.replicas is None else SLICES_THERE)
 
     def missing(self, row: MapRow, branch: str, asked: Asked) -> bytes:
         """Frames that bring the asker to the head, wholly in memory before they are sent.
@@ -71,7 +73,7 @@ class MainReplies:
             query = query_of(asked, snapshot)
             cells = CellFrames(snapshot, query, row.layer, self._cache, faults)
             frames = without_begun(reply_frames(cells, self._facts(row, snapshot)), asked.request.begun)
-            reply = b"".join([start_of_reply(), *_encoded(self._figures.counted(frames))])
+            reply = b"".join([start_of_reply(), *self._slices.of(_encoded(self._figures.counted(frames)))])
         # For the list of branches and their expiry: what the server sends never depends on it.
         self._store.seen(row, branch, query.cursor)
         if query.cursor is None:

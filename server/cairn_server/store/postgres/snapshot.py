@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from cairn_map.commits.cursor import Cursor, first_chain
+from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.ids import Author, CommitId
 from cairn_map.commits.version_vector import EMPTY, VersionVector, vector_text, version_vector_from_json
 from cairn_map.evidence.fingerprint import Fingerprint
 from cairn_map.evidence.grid import CellKey
 from cairn_map.wire.messages import LogEntry
-from cairn_server.store.history import KnownVectors
+from cairn_server.store.history import KnownVectors, ReadChains
 from cairn_server.store.objects.cold_bytes import ColdReads, split_cell_object
 from cairn_server.store.postgres.connections import Connection, first, rows
 from cairn_server.store.postgres.failures import lost_map
@@ -61,12 +61,12 @@ class PgSnapshot:
         self._connection = connection
         self._objects = objects
         self._map = map_number
-        self._layer_digest = layer_digest
         self._vectors = vectors
         head = first(connection, "SELECT log_id, seq, chain FROM head WHERE map = %s", (map_number,))
         if head is None:
             raise lost_map(connection, map_number)
         self._head = Cursor(*head)
+        self._chains = ReadChains(self._head, layer_digest)
         self._held: dict[CellKey, CellRow | None] = {}
 
     @property
@@ -76,13 +76,8 @@ class PgSnapshot:
 
     def chain_at(self, seq: int) -> bytes | None:
         """The chain after entry `seq` (0: of the empty log); None if there is no such entry."""
-        if seq == 0:
-            return first_chain(self._head.log_id, self._layer_digest)
-        if seq == self._head.seq:
-            return self._head.chain
         query = "SELECT chain FROM log WHERE map = %s AND seq = %s"
-        chain: bytes | None = first(self._connection, query, (self._map, seq))
-        return chain
+        return self._chains.get(seq, lambda: first(self._connection, query, (self._map, seq)))
 
     def cell(self, key: CellKey) -> CellRow | None:
         """One cell with its body.

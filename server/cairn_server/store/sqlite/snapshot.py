@@ -8,13 +8,13 @@ from typing import Any
 import apsw
 import numpy as np
 
-from cairn_map.commits.cursor import Cursor, first_chain
+from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.ids import Author, CommitId
 from cairn_map.commits.version_vector import EMPTY, VersionVector, version_vector_from_json
 from cairn_map.evidence.fingerprint import Fingerprint
 from cairn_map.evidence.grid import CellKey
 from cairn_map.wire.messages import LogEntry
-from cairn_server.store.history import KnownVectors
+from cairn_server.store.history import KnownVectors, ReadChains
 from cairn_server.store.sqlite.failures import damaged_pages
 from cairn_server.store.sqlite.retention import check_lives
 from cairn_server.store.sqlite.schema import IS_MEASURED
@@ -50,10 +50,10 @@ class SqliteSnapshot:
     ) -> None:
         self._connection = connection
         self._map = map_number
-        self._layer_digest = layer_digest
         self._vectors = vectors
         check_lives(connection, map_number)
         self._head = Cursor(*first(connection, "SELECT log_id, seq, chain FROM map WHERE number = ?", (map_number,)))
+        self._chains = ReadChains(self._head, layer_digest)
 
     @property
     def head(self) -> Cursor:
@@ -62,12 +62,8 @@ class SqliteSnapshot:
 
     def chain_at(self, seq: int) -> bytes | None:
         """The chain after entry `seq` (0: of the empty log); None if there is no such entry."""
-        if seq == 0:
-            return first_chain(self._head.log_id, self._layer_digest)
-        chain: bytes | None = first(
-            self._connection, "SELECT chain FROM log WHERE map = ? AND seq = ?", (self._map, seq)
-        )
-        return chain
+        query = "SELECT chain FROM log WHERE map = ? AND seq = ?"
+        return self._chains.get(seq, lambda: first(self._connection, query, (self._map, seq)))
 
     def cell(self, key: CellKey) -> CellRow | None:
         """One cell with its body."""

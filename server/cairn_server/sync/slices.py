@@ -1,0 +1,81 @@
+"""Slices of computing: a few replies are made at once, each for some milliseconds, then those that wait.
+
+    long reply     ####----####----####      a slice each, behind those that wait
+    short reply        ####                  most need only one
+
+The interpreter computes in one thread at a time, and threads that all want to compute keep pushes and the event loop
+from it: of 200 robots, pushes took 62 ms (median) beside two replies in the making, and 96 beside eight.
+"""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from typing import TypeVar
+
+T = TypeVar("T")
+
+SLICE_S = 0.01
+"""Time after which a reply lets others go on; most are made in less."""
+SLICES_HERE, SLICES_THERE = 2, 4
+"""Replies in the making at once from a store on this machine, and from a database, where they wait most of the time."""
+
+
+class Slices:
+    """Turns at computing, handed from each to the one that waits longest; thread-safe."""
+
+    def __init__(self, places: int, *, steady_s: Callable[[], float] = time.monotonic) -> None:
+        """At most `places` compute at once."""
+        self._free = places
+        self._steady_s = steady_s
+        self._lock = threading.Lock()
+        self._waiting: deque[threading.Lock] = deque()
+        """Of each thread that waits, the lock that it waits for."""
+
+    @property
+    def waiting(self) -> int:
+        """Count of the threads that wait for a slice now."""
+        return len(self._waiting)
+
+    def of(self, parts: Iterable[T]) -> Iterator[T]:
+        """The same parts, made in slices; whoever takes them must not wait between two of them."""
+        self._take()
+        try:
+            end_s = self._steady_s() + SLICE_S
+            for part in parts:
+                yield part
+                if self._steady_s() >= end_s:
+                    self._let_others()
+                    end_s = self._steady_s() + SLICE_S
+        finally:
+            self._give()
+
+    def _take(self) -> None:
+        with self._lock:
+            if self._free:
+                self._free -= 1
+                return
+            mine = self._queue()
+        mine.acquire()
+
+    def _give(self) -> None:
+        with self._lock:
+            if self._waiting:
+                self._waiting.popleft().release()  # handed over: nobody comes between
+            else:
+                self._free += 1
+
+    def _let_others(self) -> None:
+        """Hand the slice to the one that waits longest, and wait behind all others; if none waits, go on."""
+        with self._lock:
+            if not self._waiting:
+                return
+            mine = self._queue()
+            self._waiting.popleft().release()
+        mine.acquire()
+
+    def _queue(self) -> threading.Lock:
+        mine = threading.Lock()
+        mine.acquire()
+        self._waiting.append(mine)
+        return mine
