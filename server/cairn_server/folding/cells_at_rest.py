@@ -189,8 +189,25 @@ def _decoded(key: CellKey, body: bytes, decode: Callable[[bytes], DecodedCell]) 
     return decoded
 
 
+def stored_diff(snapshot: Snapshot, key: CellKey, contribution: Contribution) -> Evidence:
+    """Evidence of the commit of a log entry about a cell.
+
+    Raises:
+        DamagedDataError: kind `damaged_store`: it is not sound, or not kept any more.
+    """
+    body = snapshot.diff(contribution.commit, key)
+    if body is None:
+        raise DamagedDataError("damaged_store", f"a diff of cell {cell_of_key(key)} is not there")
+    return decode_stored(key, body).evidence
+
+
 def sum_of_contributions(
-    snapshot: Snapshot, key: CellKey, contributions: Iterable[Contribution], layer: MapLayer
+    snapshot: Snapshot,
+    key: CellKey,
+    contributions: Iterable[Contribution],
+    layer: MapLayer,
+    *,
+    diff_of: Callable[[Snapshot, CellKey, Contribution], Evidence] = stored_diff,
 ) -> HistoryCell:
     """Sum of what log entries did to a cell, each in the epoch of its commit (rule T6).
 
@@ -199,10 +216,7 @@ def sum_of_contributions(
     """
     total = HistoryCell(key, layer, row_coding(layer))
     for contribution in contributions:
-        body = snapshot.diff(contribution.commit, key)
-        if body is None:
-            raise DamagedDataError("damaged_store", f"a diff of cell {cell_of_key(key)} is not there")
-        evidence = decode_stored(key, body).evidence
+        evidence = diff_of(snapshot, key, contribution)
         if contribution.kind == ENTRY_FOLD:
             total.merge(contribution.epoch, evidence)
         else:

@@ -4,6 +4,7 @@ history     the newest log entries of a cell                 } of its state at o
 stamps      entry that changed each of its blocks            } once for all concurrent requests
 evidence    all of it, decoded, row by row: the costly part  }
 change      frame content for robots at an older entry       }
+diff        what one entry did to it, decoded: robots at many older entries need sums of the same ones
 """
 
 from dataclasses import dataclass
@@ -13,19 +14,21 @@ from cairn_map.epochs.cell_history import CellHistory
 from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import DamagedDataError
 from cairn_map.evidence.blocks import Blocks
+from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey, Geometry, cell_of_key
 from cairn_map.wire.frames import FrameKind
-from cairn_server.folding.cells_at_rest import stored_history, stored_stamps
+from cairn_server.folding.cells_at_rest import stored_diff, stored_history, stored_stamps
 from cairn_server.folding.single_flight import MadeOnce
 from cairn_server.store.stamps import Stamps
 from cairn_server.store.store import Snapshot
 from cairn_server.store.store_rows import CellRow, Contribution
 
-EVIDENCE_BYTES = 256 << 20
+EVIDENCE_BYTES = 224 << 20
 """Memory for the decoded cells of all maps."""
 STAMPS_BYTES = 32 << 20
 CHANGES_BYTES = 64 << 20
 HISTORIES_BYTES = 16 << 20
+DIFFS_BYTES = 32 << 20
 ENTRY_BYTES = 300
 """Memory of one entry of a history, or of one empty change."""
 State = tuple[bytes | None, CellKey, bytes, int]
@@ -66,6 +69,9 @@ class ReadCache:
         self._histories: MadeOnce[State, list[Contribution]] = MadeOnce(
             limit_bytes=int(share * HISTORIES_BYTES), size_of=lambda entries: ENTRY_BYTES * (1 + len(entries))
         )
+        self._diffs: MadeOnce[tuple[bytes | None, CellKey], Evidence] = MadeOnce(
+            limit_bytes=int(share * DIFFS_BYTES), size_of=lambda diff: ENTRY_BYTES + diff.size_bytes
+        )
         self.changes: MadeOnce[ChangeName, Change | None] = MadeOnce(
             limit_bytes=int(share * CHANGES_BYTES), size_of=_change_bytes
         )
@@ -91,6 +97,15 @@ class ReadCache:
         """Newest log entries of a listed cell, oldest first; every call must have the same limit."""
         state = state_of(snapshot, listed)
         return self._histories.get(state, lambda: snapshot.contributions(listed.key, after_seq=0, newest=limit))
+
+    def diff(self, snapshot: Snapshot, key: CellKey, contribution: Contribution) -> Evidence:
+        """Evidence of the commit of a log entry about a cell.
+
+        Raises:
+            DamagedDataError: kind `damaged_store`: it is not sound, or not kept any more.
+        """
+        name = snapshot.chain_at(contribution.seq), key
+        return self._diffs.get(name, lambda: stored_diff(snapshot, key, contribution))
 
 
 def state_of(snapshot: Snapshot, listed: CellRow) -> State:

@@ -95,7 +95,7 @@ def _smallest(
     cache: ReadCache,
 ) -> Change | None:
     """Smaller one of the delta and the state, if it is smaller than the whole cell."""
-    delta = _delta(snapshot, row, summed, layer) if summed is not None else None
+    delta = _delta(snapshot, row, summed, layer, cache) if summed is not None else None
     smallest = row.size_bytes if delta is None else min(len(delta), row.size_bytes)
     state = None
     # The blocks that one commit touched have all of its voxels and others: their present sums are hardly ever smaller,
@@ -110,7 +110,9 @@ def _smallest(
     return Change(FrameKind.DELTA, delta)
 
 
-def _delta(snapshot: Snapshot, row: CellRow, foreign: list[Contribution], layer: MapLayer) -> bytes | None:
+def _delta(
+    snapshot: Snapshot, row: CellRow, foreign: list[Contribution], layer: MapLayer, cache: ReadCache
+) -> bytes | None:
     """Encoded sum by epoch of what others did to a cell; None: it would be too large, or a diff is damaged or away."""
     # Diffs that together have four times the cell's bytes hardly sum up to less than the cell.
     if sum(entry.size_bytes for entry in foreign) > 4 * row.size_bytes:
@@ -127,7 +129,7 @@ def _delta(snapshot: Snapshot, row: CellRow, foreign: list[Contribution], layer:
         return None
     try:
         with DECODING.of(size_bytes):
-            history = sum_of_contributions(snapshot, row.key, foreign, layer).history()
+            history = sum_of_contributions(snapshot, row.key, foreign, layer, diff_of=cache.diff).history()
             return encode_layer_cell(row.key, history, layer).data if len(history) else b""
     except AwayError:
         return None

@@ -1,5 +1,6 @@
 """Fetch-missing: SYNC.md's rules, the server's half, each against an asker made of dictionaries."""
 
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -13,10 +14,15 @@ from tests.fixtures.server.stores import one_server
 from tests.naive.asker import KEY_FAR, NaiveAsker, cell_frames, fingerprint_sum
 
 from cairn_map.commits.cursor import Cursor, cursor_from_text
+from cairn_map.commits.ids import CommitId
+from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.fingerprint import ZERO
-from cairn_map.evidence.grid import cell_of_key
+from cairn_map.evidence.grid import CellKey, cell_of_key
 from cairn_map.wire.frames import FrameKind, frames_of
 from cairn_map.wire.messages import Done, MissingRequest, More, ReplyHeader
+from cairn_server.folding import read_cache
+from cairn_server.store.store import Snapshot
+from cairn_server.store.store_rows import Contribution
 from cairn_server.sync import cell_changes, missing
 
 
@@ -83,6 +89,33 @@ def test_what_was_taken_out_is_subtracted_in_a_delta_even_alone(live: Live) -> N
     fetch(live, row, asker)
     assert set(asker.kinds) == {FrameKind.DELTA}
     assert asker.map() == sum_of(commits[1:])
+
+
+def test_what_one_commit_did_to_a_cell_is_decoded_once_for_askers_at_all_states(
+    live: Live, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    row, decoded = live.new_map(), Counter[tuple[CommitId, CellKey]]()
+    stored_diff = read_cache.stored_diff
+
+    def counted(snapshot: Snapshot, key: CellKey, contribution: Contribution) -> Evidence:
+        decoded[contribution.commit, key] += 1
+        return stored_diff(snapshot, key, contribution)
+
+    monkeypatch.setattr(read_cache, "stored_diff", counted)
+    commits = [pushed(n, n, WREN) for n in range(12)] + [pushed(n, 1, WREN) for n in range(12, 16)]
+    askers = [NaiveAsker(MOLE) for _ in range(3)]
+    for commit in commits[:12]:
+        live.push(row, commit)
+    for commit, asker in zip(commits[12:], [*askers, None], strict=True):
+        if asker is not None:
+            fetch(live, row, asker)
+            asker.kinds.clear()
+        live.push(row, commit)
+    for asker in askers:
+        fetch(live, row, asker)
+        assert set(asker.kinds) == {FrameKind.DELTA}
+        assert asker.map() == sum_of(commits)
+    assert decoded == {(commit.id, key): 1 for commit in commits[12:] for key in commit.cells}
 
 
 def test_what_is_pending_is_not_stable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
