@@ -167,7 +167,12 @@ def instant_of(text: str, *, now: datetime | None = None) -> float:
     """
     age = AGE.fullmatch(text)
     if age is None:
-        time_s = seconds_of(text, now=now)
+        try:
+            time_s = seconds_of(text, now=now)
+        except BadInputError as exc:
+            raise BadInputError(
+                exc.kind, f"a time is an age (30m, 2h, 7d ago), or {exc.message.removeprefix('a time is ')}"
+            ) from exc
         assert time_s is not None  # noqa: S101 - of a text it is never None
         return time_s
     return (now or datetime.now(UTC)).timestamp() - float(age[1]) * UNITS_S[age[2]]

@@ -1,12 +1,13 @@
 """A copy of a map in a folder, that a later pull brings up to date by what changed alone."""
 
 import secrets
+import shutil
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from cairn_client.folders.state_folder import is_copy, is_state_folder, opened_replica, url_of
 from cairn_client.robot.robot import Robot
-from cairn_map.errors import BadInputError, ConflictError
+from cairn_map.errors import BadInputError, CairnError, ConflictError
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +48,33 @@ def clone(map_url: str, folder: Path, *, token: str | None, name: str | None = N
     if folder.exists() and any(folder.iterdir()):
         known = "; `cairn pull` brings it up to date" if is_state_folder(folder) else ""
         raise ConflictError("copy_exists", f"{folder} is not empty{known}")
-    return _pull(map_url, folder, token=token, name=name or f"copy-{secrets.token_hex(4)}")
+    is_new = not folder.exists()
+    try:
+        return _pull(map_url, folder, token=token, name=name or f"copy-{secrets.token_hex(4)}")
+    except CairnError:
+        if not _can_be_pulled(folder):
+            _remove(folder, is_new=is_new)
+        raise
+
+
+def _can_be_pulled(folder: Path) -> bool:
+    """True if a copy knows its map, so that a pull finishes it."""
+    try:
+        with opened_replica(folder):
+            return True
+    except BadInputError:
+        return False
+
+
+def _remove(folder: Path, *, is_new: bool) -> None:
+    """Remove what a clone left in a folder that was empty, and the folder if it was new."""
+    for path in folder.iterdir() if folder.is_dir() else ():
+        if path.is_dir():
+            shutil.rmtree(path)
+        else:
+            path.unlink()
+    if is_new and folder.is_dir():
+        folder.rmdir()
 
 
 def pull(folder: Path, *, token: str | None = None) -> Pulled:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from cairn_client.folders.needed_cells import Needs, needed_cells
 from cairn_client.folders.state_folder import is_state_folder, opened_replica
 from cairn_client.http.api import MapApi
 from cairn_client.http.http_link import cells_with_evidence, download_cell
@@ -66,6 +67,11 @@ def open_map(
     return map_of_folder(Path(place), at_s=at_s).snapshot
 
 
+def open_part(map_url: str, needs: Needs, *, token: str | None = None, at_s: float | None = None) -> MapSnapshot:
+    """The cells of a server's map that a question needs; raises as `open_map`."""
+    return _downloaded_map(map_url, token, standard_limit_bytes(), at_s, needs)
+
+
 def map_of_folder(folder: Path, *, at_s: float | None = None) -> FolderMap:
     """The map in a folder, under its own sensor model, now or at a time, and how old it is where that is known.
 
@@ -91,12 +97,15 @@ def map_of_folder(folder: Path, *, at_s: float | None = None) -> FolderMap:
     )
 
 
-def _downloaded_map(map_url: str, token: str | None, memory_bytes_max: int, at_s: float | None) -> MapSnapshot:
+def _downloaded_map(
+    map_url: str, token: str | None, memory_bytes_max: int, at_s: float | None, needs: Needs | None = None
+) -> MapSnapshot:
     server_url, name = split_map_url(map_url)
     with MapApi(server_url, token=token) as api:
         info = api.map_info(name)
         whole = HistoryMap(info.layer, coding=coding_of(info.geometry))
-        for key in cells_with_evidence(api, name):
+        keys = cells_with_evidence(api, name)
+        for key in keys if needs is None else needed_cells(keys, needs, info.geometry):
             # What is left bounds the cell before it is decoded: few bytes may stand for much evidence.
             left_bytes = memory_bytes_max - whole.size_bytes
             try:

@@ -16,7 +16,7 @@ from cairn_client.folders.map_folder import open_map
 from cairn_client.folders.state_folder import opened_replica
 from cairn_client.http.api import MapApi
 from cairn_client.robot.robot import Robot
-from cairn_map.errors import BadInputError, ConflictError, UnreachableError
+from cairn_map.errors import BadInputError, ConflictError, NotFoundError, UnreachableError
 from cairn_map.wire.messages import CreateMap
 
 
@@ -134,3 +134,32 @@ def test_a_map_of_a_server_is_opened_within_its_memory_limit_and_refused_beyond(
         with pytest.raises(BadInputError) as caught:
             open_map(server.map_url, memory_bytes_max=memory_bytes_max)
         assert caught.value.kind == "too_large" and "memory_bytes_max" in caught.value.message
+
+
+def test_a_clone_that_cannot_begin_leaves_the_disk_as_it_was(server: LiveServer, tmp_path: Path) -> None:
+    wrong = {f"{server.url}/maps/none": NotFoundError, "http://127.0.0.1:1/maps/lab": UnreachableError}
+    place = tmp_path / "place"
+    (empty := place / "empty").mkdir(parents=True)
+    for url, error in wrong.items():
+        for folder in (place / "new", empty):
+            with pytest.raises(error):
+                clone(url, folder, token=None)
+    assert [path.name for path in place.rglob("*")] == ["empty"]
+    clone(server.map_url, place / "new", token=None)
+    clone(server.map_url, empty, token=None)
+
+
+def test_a_clone_that_was_cut_off_is_finished_by_a_pull(
+    server: LiveServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    push_diffs(server, tmp_path / "mole", {A: seen(1, 2, 3)})
+    copy = tmp_path / "copy"
+
+    def cut(*_: object, **__: object) -> None:
+        raise UnreachableError("no_link", "the link is cut")
+
+    with monkeypatch.context() as link:
+        link.setattr(Robot, "sync", cut)
+        with pytest.raises(UnreachableError):
+            clone(server.map_url, copy, token=None)
+    assert pull(copy).cells == 1

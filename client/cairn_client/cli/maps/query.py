@@ -12,11 +12,11 @@
     $ cairn map query lab/ height --box=-5,-5,0,5,5,2         # the highest surface of each column, metres
     $ cairn map query lab/ --at 14:05 nearest 1,2,0.4         # as it was then, in a map with epochs
 
-A map is a URL, whose cells are all downloaded first (the server itself finds the hottest, unless --at asks for the
-past), or a folder: one of `cairn map export --cells`, a clone, or the state folder of a robot that is not running. All
-lengths are metres in the map's frame, temperatures degrees Celsius here and kelvin in JSON; unknown values are `-`, in
-JSON null. Of a map with epochs, points have the time at which they were seen last, too: the beginning of its newest
-epoch, UTC.
+A map is a URL, or a folder: one of `cairn map export --cells`, a clone, or the state folder of a robot that is not
+running. Of a URL those cells are downloaded that points, rays and nearest voxels need, and all for `slice`, `height`
+and --at with `hottest`; else the server itself finds the hottest. All lengths are metres in the map's frame,
+temperatures degrees Celsius here and kelvin in JSON; unknown values are `-`, in JSON null. Of a map with epochs, points
+have the time at which they were seen last, too: the beginning of its newest epoch, UTC.
 --json prints JSON for programs; `slice` and `height` then give all pixels, rows along y and columns along x.
 """
 
@@ -32,7 +32,8 @@ import numpy.typing as npt
 
 from cairn_client.cli.arguments import Subparsers, add_at, add_token, api_of, say, seconds_of
 from cairn_client.cli.robot_arguments import box, place
-from cairn_client.folders.map_folder import open_map
+from cairn_client.folders.map_folder import open_map, open_part
+from cairn_client.folders.needed_cells import Needs, along_ray, near_points
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.voxels import Reading
@@ -51,6 +52,8 @@ NOTHING_HOT = "no occupied voxel has a temperature"
 SIGNS = {State.UNKNOWN: " ", State.FREE: ".", State.OCCUPIED: "#"}
 Answer = Callable[[MapSnapshot, argparse.Namespace], tuple[Any, list[str]]]
 """Answer to a question, as JSON and as lines for people."""
+Needed = Callable[[argparse.Namespace], Needs | None]
+"""Cells of a server's map that a question needs; None: all."""
 
 
 def add_parser(commands: Subparsers) -> None:
@@ -63,21 +66,21 @@ def add_parser(commands: Subparsers) -> None:
     query.set_defaults(run=_run)
     questions = query.add_subparsers(required=True, metavar="QUESTION")
 
-    def question(name: str, text: str, answer: Answer) -> argparse.ArgumentParser:
+    def question(name: str, text: str, answer: Answer, needs: Needed = _all) -> argparse.ArgumentParser:
         added = questions.add_parser(name, help=text, description=text)
         added.add_argument("--json", action="store_true", help="print JSON")
-        added.set_defaults(answer=answer)
+        added.set_defaults(answer=answer, needs=needs)
         return added
 
-    points = question("points", "state, probability and readings at points", _points)
+    points = question("points", "state, probability and readings at points", _points, _at_points)
     points.add_argument("points", nargs="+", type=place, metavar="X,Y,Z", help="metres, map frame")
-    ray = question("ray", "the first occupied voxel along a ray", _ray)
+    ray = question("ray", "the first occupied voxel along a ray", _ray, _on_ray)
     ray.add_argument("origin", type=place, metavar="X,Y,Z", help="metres, map frame")
     ray.add_argument("direction", type=place, metavar="DX,DY,DZ", help="direction, of any length")
     ray.add_argument(
         "--range", type=float, default=math.inf, metavar="METRES", help="longest distance (as far as the map goes)"
     )
-    nearest = question("nearest", "the nearest occupied voxel of points", _nearest)
+    nearest = question("nearest", "the nearest occupied voxel of points", _nearest, _within_radius)
     nearest.add_argument("points", nargs="+", type=place, metavar="X,Y,Z", help="metres, map frame")
     nearest.add_argument("--radius", type=float, default=5.0, metavar="METRES", help="longest distance (5)")
     nearest.add_argument("--unknown", action="store_true", help="the nearest unknown voxel instead")
@@ -97,11 +100,35 @@ def _run(args: argparse.Namespace) -> int:
     if is_server and answer is _hottest and args.at is None:
         found, lines = _hottest_of_server(args)
     else:
-        token = args.token.of(args.map) if is_server else None
-        found, lines = answer(open_map(args.map, token=token, at_s=seconds_of(args.at)), args)
+        found, lines = answer(_opened(args) if is_server else open_map(args.map, at_s=seconds_of(args.at)), args)
     for line in [json.dumps(found)] if args.json else lines:
         say(line)
     return 0
+
+
+def _opened(args: argparse.Namespace) -> MapSnapshot:
+    """A server's map, as far as the question needs it."""
+    token, at_s = args.token.of(args.map), seconds_of(args.at)
+    needs: Needs | None = args.needs(args)
+    if needs is None:
+        return open_map(args.map, token=token, at_s=at_s)
+    return open_part(args.map, needs, token=token, at_s=at_s)
+
+
+def _all(args: argparse.Namespace) -> None:
+    return None
+
+
+def _at_points(args: argparse.Namespace) -> Needs:
+    return near_points(args.points)
+
+
+def _within_radius(args: argparse.Namespace) -> Needs:
+    return near_points(args.points, radius_m=args.radius)
+
+
+def _on_ray(args: argparse.Namespace) -> Needs:
+    return along_ray(args.origin, args.direction, range_m=args.range)
 
 
 def _points(snapshot: MapSnapshot, args: argparse.Namespace) -> tuple[Any, list[str]]:
