@@ -260,8 +260,8 @@ def clock_metrics(doubt_s: float) -> Iterator[Metric]:
 
 
 RELEASED_S = 1_795_478_400.0
-"""Date of this program, UTC seconds since 1970 (2026-11-24): a clock that stands before it is wrong. To be moved on
-with each release; never ahead of it."""
+"""Date of this program, UTC seconds since 1970 (2026-11-24): a clock that stands before it is wrong. Never before
+the day of the newest release in CHANGELOG.md, which a test compares, and never ahead of today."""
 
 
 PROCESS = ProcessCollector(registry=None)

@@ -20,7 +20,7 @@ from cairn_map.errors import UnreachableError
 from cairn_server.access.auth import TokenHolders
 from cairn_server.access.cancellation import StopTime
 from cairn_server.access.rate_limits import ActLimit
-from cairn_server.access.server_certificate import certificate_of
+from cairn_server.access.server_certificate import ServerCertificate, certificate_of
 from cairn_server.access.wrong_tokens import WrongTokens
 from cairn_server.cell_room import DECODING
 from cairn_server.folding.cells import Cells
@@ -108,16 +108,18 @@ class Service:
         store: Store,
         settings: Settings,
         *,
+        certificate: ServerCertificate | None = None,
         fold_process: FoldProcess | None = None,
         warming: Callable[[], str | None] = lambda: None,
     ) -> None:
         """Start the parts; without `fold_process` a thread folds, if the service is to fold at all.
 
-        It is not ready until `warming` is None: what the start still waits for.
+        `certificate` is the one of the settings, where it was read before. It is not ready until `warming` is None:
+        what the start still waits for.
         """
         self.store = store
         self.settings = settings
-        self.certificate = certificate_of(settings)
+        self.certificate = certificate or certificate_of(settings)
         self.holders = TokenHolders(store, settings)
         self.figures = ServerFigures()
         self._full_authors_now: list[UsedPart] = []

@@ -238,6 +238,15 @@ class Settings(BaseModel):
                 "everything in its folder",
             )
 
+    def check_upstream(self) -> None:
+        """Refuse an upstream server whose URL is none.
+
+        Raises:
+            BadInputError: kind `bad_url`.
+        """
+        if self.upstream is not None:
+            origin_of(self.upstream)
+
     def check_tls(self) -> None:
         """Refuse a certificate without its key, and a key without its certificate.
 

@@ -4,6 +4,7 @@ A map that waits for a damaged cell does not count: the other maps go on, and a 
 would stop those, too. Damage is a figure to watch instead (`cairn_fold_failures_total`).
 """
 
+import logging
 import threading
 import time
 from collections.abc import Callable, Iterable
@@ -13,6 +14,8 @@ from cairn_server.metrics import ServerFigures
 from cairn_server.settings import Settings
 from cairn_server.store.objects.cold_bytes import AwayError
 from cairn_server.store.store import StoreHealth
+
+log = logging.getLogger(__name__)
 
 KEEP_S = 1.0
 """Lifetime of an answer: any client may ask, and each look writes to the disk."""
@@ -90,6 +93,7 @@ class Readiness:
         self._lock = threading.Lock()
         self._looked_s = float("-inf")
         self._reasons: list[str] = []
+        self._codes: set[str] = set()
         self._is_closing = False
         self._is_short = False
         """True from the moment at which the disk had too little room until it has clearly enough."""
@@ -111,7 +115,15 @@ class Readiness:
             if time.monotonic() - self._looked_s >= KEEP_S:
                 self._reasons = list(self._look())
                 self._looked_s = time.monotonic()
+                self._tell()
             return list(self._reasons)
+
+    def _tell(self) -> None:
+        """Log that the server is ready no more, for another reason, or again: a probe's answers are not logged."""
+        codes = {reason.partition(":")[0] for reason in self._reasons}
+        if codes != self._codes:
+            log.warning("not ready: %s", "; ".join(self._reasons)) if codes else log.warning("ready again")
+        self._codes = codes
 
     def check(self) -> None:
         """Return if the server is ready.

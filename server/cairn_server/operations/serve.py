@@ -58,6 +58,7 @@ from fastapi import FastAPI
 
 from cairn_map.errors import BadInputError
 from cairn_map.kernels.kernel_cache import keep_kernels
+from cairn_server.access.server_certificate import certificate_of
 from cairn_server.access.turns import Turns
 from cairn_server.folding.fold_memory import FoldMemory
 from cairn_server.folding.fold_process import fork_folding
@@ -121,9 +122,11 @@ def main(argv: list[str]) -> int:
     args = serve_parser(__doc__).parse_args(argv)
     start_logging(LogForm(args.log_format), logging.INFO if args.verbose else logging.WARNING)
     settings = settings_of(args)
+    # All that can be known to be wrong is, before a store is made.
     settings.check_reach()
-    settings.check_tls()
     settings.check_store()
+    settings.check_upstream()
+    certificate = certificate_of(settings)
     settings = settings.model_copy(update={"limit_concurrency": connections_within(settings.limit_concurrency)})
     signal.signal(signal.SIGTERM, _stop)
     signal.signal(
@@ -142,7 +145,11 @@ def main(argv: list[str]) -> int:
         try:
             warm_start = WarmStart()
             service = Service(
-                opened(open_store, settings), settings, fold_process=folding, warming=warm_start.complaint
+                opened(open_store, settings),
+                settings,
+                certificate=certificate,
+                fold_process=folding,
+                warming=warm_start.complaint,
             )
             with closing(service), _views_of(service), settling(service), joined(service) as relay, warm_start:
                 Reload(service, lambda: settings_of(args), relay).at_signal()
@@ -189,10 +196,10 @@ def _serve(service: Service, listener: socket.socket, long_bodies: LongBodies, l
     # looks at it; and what survived two sweeps of young objects is seldom a cycle.
     gc.freeze()
     gc.set_threshold(*gc.get_threshold()[:2], FULL_SWEEPS_AFTER)
-    _Server(config, app).run(sockets=[listener])
+    StoppableServer(config, app).run(sockets=[listener])
 
 
-class _Server(uvicorn.Server):
+class StoppableServer(uvicorn.Server):
     """uvicorn's server, which at a signal says that it is not ready, and ends when proxies have noticed.
 
     A connection that a proxy keeps and this side closes loses the request that is on its way just then, and a push that
@@ -203,9 +210,27 @@ class _Server(uvicorn.Server):
         super().__init__(config)
         self._service: Service = app.state.service
         self._turns: tuple[Lanes, Turns] = app.state.lanes, app.state.reading
+        self._stopped_by: int | None = None
+
+    def run(self, sockets: list[socket.socket] | None = None) -> None:
+        """Serve until stopped. A signal that comes before the loop runs ends it as one that comes later does.
+
+        Raises:
+            KeyboardInterrupt: it was stopped by a signal, which its text names.
+        """
+        numbers = (signal.SIGINT, signal.SIGTERM)
+        before = {number: signal.signal(number, self.handle_exit) for number in numbers}
+        try:
+            super().run(sockets)
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+        if self._stopped_by is not None:
+            raise KeyboardInterrupt(signal.Signals(self._stopped_by).name)
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
         """Say that the server stops, and stop it after a while, or at a second signal at once."""
+        self._stopped_by = self._stopped_by or sig
         drain_s = self._service.settings.drain_s
         if drain_s and not self._service.readiness.is_closing:
             self._service.readiness.close()
@@ -253,7 +278,7 @@ def config_of(app: FastAPI, settings: Settings, *, log_level: str = "warning") -
 
 
 def _stop(number: int, frame: FrameType | None) -> None:
-    """End as Ctrl-C does, with everything closed: uvicorn raises the signal again once its answers are finished."""
+    """End as Ctrl-C does, with everything closed; while requests are answered the signal is `StoppableServer`'s."""
     raise KeyboardInterrupt(signal.Signals(number).name)
 
 

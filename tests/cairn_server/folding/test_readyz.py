@@ -129,3 +129,19 @@ def test_a_disk_at_its_bound_does_not_come_and_go(live: Live, monkeypatch: pytes
         assert said == "" or said.startswith("disk_full: ")
     ready, short = True, False
     assert seen == [ready, ready, short, short, short, short, ready, ready, short, short, ready]
+
+
+def test_a_change_is_one_line_of_the_log_however_often_probes_ask(
+    live: Live, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert reasons(live) == ""
+    with monkeypatch.context() as broken:
+        broken.setattr(sqlite_store, "_rewrite_version", raising(apsw.FullError("database or disk is full")))
+        for _ in range(5):
+            assert reasons(live).startswith("disk_full: ")
+    for _ in range(5):
+        assert reasons(live) == ""
+    lines = [(record.name, record.getMessage().partition(":")[0]) for record in caplog.records]
+    of_readiness = [text for name, text in lines if name == readiness.__name__]
+    assert of_readiness == ["not ready", "ready again"]
+    assert not [name for name, _ in lines if name.endswith("request_trail")]

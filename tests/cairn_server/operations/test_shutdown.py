@@ -1,9 +1,11 @@
 """SIGTERM under load: what is under way is answered, all that was acknowledged is there afterwards."""
 
+import asyncio
 import signal
 import socket
 import threading
 import time
+from contextlib import closing
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -16,6 +18,11 @@ from tests.fixtures.server.pushes import KEYS, MOLE, WREN, pushed, read, sum_of
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.ids import Author, CommitId, Incarnation, RobotName
 from cairn_map.evidence.grid import cell_of_key
+from cairn_server.http.app import make_app
+from cairn_server.operations.serve import StoppableServer, config_of, listen
+from cairn_server.service import Service
+from cairn_server.settings import Settings
+from cairn_server.store.sqlite.store import SqliteStore
 
 pytestmark = pytest.mark.processes
 
@@ -97,3 +104,23 @@ def test_a_body_that_never_ends_is_cut_when_the_server_stops(tmp_path: Path) -> 
             assert http.get("/healthz").status_code == 200
             process.send(signal.SIGTERM)
             assert process.end() == (0, "")
+
+
+def told_to_stop() -> asyncio.AbstractEventLoop:
+    """A new loop of a process that is told to stop just before the loop runs."""
+    signal.raise_signal(signal.SIGTERM)
+    return asyncio.new_event_loop()
+
+
+@pytest.mark.parametrize("drain_s", [0.0, 0.01])
+def test_a_server_that_is_told_to_stop_before_it_serves_stops_without_a_complaint(
+    tmp_path: Path, drain_s: float
+) -> None:
+    handler = signal.getsignal(signal.SIGTERM)
+    with closing(Service(SqliteStore(tmp_path), Settings(folder=tmp_path, drain_s=drain_s))) as service:
+        app = make_app(service)
+        config = config_of(app, service.settings)
+        config.loop = f"{__name__}:told_to_stop"
+        with listen("127.0.0.1", 0) as listener, pytest.raises(KeyboardInterrupt, match="SIGTERM"):
+            StoppableServer(config, app).run(sockets=[listener])
+    assert signal.getsignal(signal.SIGTERM) is handler

@@ -4,64 +4,30 @@ The code is a copy that no user may write to, with the kernels of `cairn compile
 root, the server runs without a capability, so that modes count for it as for any user.
 """
 
-import os
 import re
-import shutil
 import signal
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from tests.fixtures.server.live import Process, until
+from tests.fixtures.server.live import until
 from tests.fixtures.server.processes import all_folded, children_of, client, make_map
 from tests.fixtures.server.pushes import KEYS, pushed
-from tests.fixtures.sources import FOLDERS, ROOT
+from tests.fixtures.server.service_user import ServiceUser, service_user
 
 from cairn_map.evidence.grid import cell_of_key
 
 pytestmark = pytest.mark.processes
 
-DROPPED = ("setpriv", "--inh-caps=-all", "--bounding-set=-all", "--no-new-privs")
-
-
-class Service:
-    """Folders of a service user: one for data, and the code."""
-
-    def __init__(self, place: Path, *, kernels: bool) -> None:
-        """Copy the code, with the kernels that lie next to it or without any."""
-        self.data = place / "data"
-        self.data.mkdir()
-        self._code = place / "code"
-        left_out = ["static", *(() if kernels else ("*.nbi", "*.nbc", "cairn_*-*"))]
-        for package, folder in FOLDERS.items():
-            shutil.copytree(ROOT / folder / package, self._code / package, ignore=shutil.ignore_patterns(*left_out))
-        for path in (self._code, *self._code.rglob("*")):
-            path.chmod(0o555 if path.is_dir() else 0o444)
-
-    @property
-    def under(self) -> tuple[str, ...]:
-        return (*(DROPPED if os.geteuid() == 0 else ()), "env", "HOME=/nonexistent", f"PYTHONPATH={self._code}")
-
-    def start(self) -> Process:
-        return Process(self.data, under=self.under)
-
-    def close(self) -> None:
-        for path in (self._code, *self._code.rglob("*")):
-            if path.is_dir():
-                path.chmod(0o755)
-
 
 @pytest.fixture
-def service(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Service]:
-    if os.geteuid() == 0 and shutil.which(DROPPED[0]) is None:
-        pytest.skip("setpriv is missing")
-    service = Service(tmp_path, kernels=request.param)
-    yield service
-    service.close()
+def service(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[ServiceUser]:
+    with service_user(tmp_path, kernels=request.param) as found:
+        yield found
 
 
 @pytest.mark.parametrize("service", [False], indirect=True)
-def test_it_lives_at_once_and_compiles_into_the_data_folder_before_it_is_ready(service: Service) -> None:
+def test_it_lives_at_once_and_compiles_into_the_data_folder_before_it_is_ready(service: ServiceUser) -> None:
     process = service.start()
     with client(process) as http:
         assert http.get("/healthz").status_code == 200
@@ -77,7 +43,7 @@ def test_it_lives_at_once_and_compiles_into_the_data_folder_before_it_is_ready(s
 
 
 @pytest.mark.parametrize("service", [True], indirect=True)
-def test_kernels_next_to_read_only_code_are_all_that_it_needs(service: Service) -> None:
+def test_kernels_next_to_read_only_code_are_all_that_it_needs(service: ServiceUser) -> None:
     process = service.start()
     with client(process) as http:
         assert http.get("/readyz").status_code == 200
@@ -94,7 +60,7 @@ def test_kernels_next_to_read_only_code_are_all_that_it_needs(service: Service) 
 
 
 @pytest.mark.parametrize("service", [False], indirect=True)
-def test_without_a_folder_for_kernels_it_goes_on_and_says_so_in_one_line(service: Service) -> None:
+def test_without_a_folder_for_kernels_it_goes_on_and_says_so_in_one_line(service: ServiceUser) -> None:
     (service.data / "kernels").write_text("a file, where a folder should be")
     process = service.start()
     with client(process) as http:
@@ -103,5 +69,7 @@ def test_without_a_folder_for_kernels_it_goes_on_and_says_so_in_one_line(service
     process.send(signal.SIGTERM)
     code, said = process.end()
     assert code == 0
-    (line,) = (line for line in said.splitlines() if "kernels" in line and "compiling kernels, only once" not in line)
+    (line,) = (
+        line for line in said.splitlines() if "kernels" in line and "compiling kernels, only this once" not in line
+    )
     assert line.endswith("no folder takes compiled kernels: each process compiles its own, and first requests wait")

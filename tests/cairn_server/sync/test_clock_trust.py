@@ -1,6 +1,7 @@
 """Trust in a server's clock: nothing is handed out or judged by one that jumped or is behind, and no commit is lost."""
 
 import math
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
@@ -317,7 +318,16 @@ def test_answers_say_the_time_where_it_is_asked_for_and_trusted_and_an_admin_say
         assert kind_of(live.http.post("/clock", headers=chief)) == "clock_behind"
 
 
-def test_the_date_of_this_program_is_past() -> None:
+def newest_release_s(changelog: str) -> float:
+    """Day of the newest release, as its heading says it; minus infinity before the first one."""
+    days = re.findall(r"^## .+ - (\d{4}-\d\d-\d\d)$", changelog, re.MULTILINE)
+    return max((datetime.fromisoformat(f"{day}T00:00Z").timestamp() for day in days), default=-math.inf)
+
+
+def test_the_date_of_this_program_is_past_and_moves_with_each_release() -> None:
     changelog = Path(__file__).parents[3] / "CHANGELOG.md"
-    assert changelog.stat().st_mtime >= RELEASED_S
+    assert (
+        newest_release_s("## Unreleased\n\n## 0.2.0 - 1970-01-03\n\n### Added\n\n## 0.1.0 - 1970-01-02\n") == 2 * DAY_S
+    )
+    assert newest_release_s(changelog.read_text()) <= RELEASED_S <= changelog.stat().st_mtime
     assert datetime.fromtimestamp(RELEASED_S, UTC).hour == 0

@@ -29,7 +29,9 @@ METHODS = frozenset({"GET", "PUT", "POST", "DELETE", "HEAD", "OPTIONS", "PATCH"}
 PUSH = "/maps/{name}/commits/{commit}"
 CHANGING = frozenset({"PUT", "POST", "DELETE", "PATCH"})
 QUIET = frozenset({"/healthz", "/readyz", "/metrics"})
-"""Routes that machines ask every few seconds: logged at level DEBUG."""
+"""Routes that machines ask every few seconds: logged at level DEBUG, also while the server is not ready, since it says
+itself when it ceases to be (`readiness`)."""
+NOT_READY = 503
 OUTCOMES = {201: "new", 200: "known"}
 TEXT_MAX = 96
 
@@ -112,7 +114,9 @@ class RequestTrail:
             self._note_push(scope["path_params"].get("name", ""), trail)
         if method in CHANGING:
             self._note_robot(scope, route, trail)
-        level = logging.WARNING if trail.status >= 500 else logging.DEBUG if route in QUIET else logging.INFO
+        level = logging.INFO if trail.status < 500 else logging.WARNING
+        if route in QUIET and (trail.status < 500 or trail.status == NOT_READY):
+            level = logging.DEBUG
         if log.isEnabledFor(level):
             log.log(level, "request", extra=fields(**_line(scope, method, route, trail, seconds)))
 
