@@ -12,7 +12,7 @@ from cairn_map.errors import EXIT_CODES, BadInputError, ConflictError, DamagedDa
 from cairn_map.progress import PercentLine
 from cairn_server.http.middleware.log_format import LogForm, add_log_format, fields, start_logging
 from cairn_server.operations.check import check_all
-from cairn_server.settings import Settings
+from cairn_server.operations.folder_option import add_folder
 from cairn_server.store.sqlite.archive import SqliteArchive
 from cairn_server.store.sqlite.backup import Restored, back_up, restore, send_backup
 from cairn_server.store.sqlite.files.compaction import compact
@@ -52,6 +52,10 @@ cell by cell, and fetch what differs. They push again every commit that the serv
 all that were not `stable`. A robot that was registered after the backup must register again (401). Retracts that robots
 kept come back in the same way; those that an operator made and no robot heard of must be made again.
 """
+BACKUP_INSTEAD = (
+    "a store in PostgreSQL is backed up and restored by the database's own tools (pg_basebackup); docs/scale.md, "
+    '"Backup, restore, failover", has the commands'
+)
 NEXT = """Start `cairn serve --data {folder}`. Robots notice by themselves: they compare their cells with the server's,
 fetch what differs, and push again what is newer than the backup. Those registered after it must register again.
 """
@@ -62,7 +66,7 @@ def back_up_command(argv: list[str]) -> int:
     parser = argparse.ArgumentParser(
         "cairn serve backup", description=BACKUP, epilog=EXIT_CODES, formatter_class=argparse.RawTextHelpFormatter
     )
-    parser.add_argument("--data", type=Path, default=Settings().folder, metavar="DIR", help="folder of the store")
+    add_folder(parser, instead=BACKUP_INSTEAD)
     parser.add_argument(
         "file", metavar="FILE", help="the backup; an older one of that name is replaced; -: standard output"
     )
@@ -99,7 +103,7 @@ def restore_command(argv: list[str]) -> int:
         "cairn serve restore", description=RESTORE, epilog=EXIT_CODES, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("file", type=Path, metavar="FILE", help="a file that `cairn serve backup` made")
-    parser.add_argument("--data", type=Path, default=Settings().folder, metavar="DIR", help="a new or empty folder")
+    add_folder(parser, instead=BACKUP_INSTEAD, what="a new or empty folder")
     parser.add_argument("--old", type=Path, metavar="DIR", help="folder of the server that it replaces")
     args = parser.parse_args(argv)
     progress = PercentLine("restore")
@@ -170,7 +174,7 @@ def compact_command(argv: list[str]) -> int:
     parser = argparse.ArgumentParser(
         "cairn serve compact", description=COMPACT, epilog=EXIT_CODES, formatter_class=argparse.RawTextHelpFormatter
     )
-    parser.add_argument("--data", type=Path, default=Settings().folder, metavar="DIR", help="folder of the store")
+    add_folder(parser, instead="in PostgreSQL autovacuum makes room, and VACUUM FULL gives it back to the disk")
     args = parser.parse_args(argv)
     try:
         found = compact(args.data)

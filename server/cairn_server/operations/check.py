@@ -34,6 +34,7 @@ from cairn_server.operations.bucket_owner import bucket_complaints, settings_of_
 from cairn_server.operations.store_opening import store_of
 from cairn_server.settings import Settings
 from cairn_server.store.sqlite.archive import SqliteArchive
+from cairn_server.store.sqlite.backup import give_store_to_owner
 from cairn_server.store.sqlite.store import FILE_NAME, SqliteStore
 from cairn_server.store.store import Store
 from cairn_server.store.store_rows import MapRow
@@ -62,6 +63,7 @@ def main(argv: list[str]) -> int:
             left = [text for row, finding in outcome.findings for text in _healed(store, row, finding)]
         finally:
             store.close()
+            give_store_to_owner(args.data)
     else:
         archive = SqliteArchive(args.data / FILE_NAME)
         try:

@@ -8,6 +8,8 @@ the container, which is one user.
 import logging
 import os
 import stat
+from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 
 log = logging.getLogger(__name__)
@@ -34,6 +36,24 @@ def close_to_others(path: Path) -> None:
         return
     except PermissionError:
         log.warning("%s may be read by other users, and belongs to one: chown it to the server's user", path)
+
+
+def give_to_owner(paths: Iterable[Path]) -> None:
+    """Give files that root has made to the owner of their folder, whose server could not open them otherwise.
+
+    A link, or a file that has another name, too, stays root's: the owner may have put it there.
+    """
+    if os.geteuid():
+        return
+    for path in paths:
+        with suppress(OSError):
+            descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+            try:
+                found, owner = os.fstat(descriptor), path.parent.stat()
+                if stat.S_ISREG(found.st_mode) and found.st_nlink == 1 and found.st_uid == 0:
+                    os.fchown(descriptor, owner.st_uid, owner.st_gid)
+            finally:
+                os.close(descriptor)
 
 
 def warn_if_open(path: Path) -> None:

@@ -1,7 +1,8 @@
 """Rows of a store from the columns that databases keep of them."""
 
 import json
-from typing import Any
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
 
 from cairn_map.commits.ids import CommitId, commit_id_from_text
 from cairn_map.epochs.epoch import BASE, Epoch
@@ -9,6 +10,14 @@ from cairn_map.evidence.fingerprint import fingerprint_from_bytes
 from cairn_map.evidence.grid import CellKey
 from cairn_map.wire.messages import LogEntry
 from cairn_server.store.store_rows import CellRow
+
+
+class TableRows(NamedTuple):
+    """Rows of one table of a map, on their way from one database to another."""
+
+    name: str
+    columns: tuple[str, ...]
+    rows: Iterable[Sequence[Any]]
 
 
 def cell_row(columns: tuple[Any, ...]) -> CellRow:

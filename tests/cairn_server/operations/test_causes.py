@@ -67,6 +67,26 @@ def test_what_is_no_store_is_called_so(tmp_path: Path) -> None:
     assert (code, "is not a store" in said, "[bad_store]" in said) == (1, True, True), said
 
 
+def test_commands_on_what_is_no_store_call_it_so(folder: Path, tmp_path: Path) -> None:
+    cairn("serve", "archive", "map0", "map0.cairn", "--data", folder, folder=tmp_path)
+    (tmp_path / "none").mkdir()
+    (tmp_path / "none" / FILE_NAME).write_bytes(b"no database" * 1000)
+    for words in (["compact"], ["check"], ["archive", "map0", "x.cairn"], ["unarchive", "map0.cairn"]):
+        said = cairn("serve", *words, "--data", "none", folder=tmp_path, code=1)
+        assert f"none/{FILE_NAME} is not a store: " in said, words
+    assert not (tmp_path / "x.cairn").exists()
+
+
+def test_commands_on_a_full_disk_call_it_so(folder: Path, tmp_path: Path, disk: TinyDisk) -> None:
+    cairn("serve", "archive", "map0", "map0.cairn", "--data", folder, folder=tmp_path)
+    shutil.copytree(folder, disk.folder / "data")
+    disk.fill()
+    for words, code in ((["compact"], 5), (["check"], 5), (["unarchive", "map0.cairn"], 1)):
+        said = cairn("serve", *words, "--data", disk.folder / "data", folder=tmp_path, code=code)
+        assert "its disk is full" in said or "there is no room" in said, words
+        assert ".partial" not in said, words
+
+
 def test_a_store_of_another_user_says_whose_it_must_be(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", "/tmp")
     if shutil.which(NOBODY[0]) is None or os.geteuid():
@@ -114,6 +134,8 @@ def test_a_store_of_a_newer_version_says_to_update_this_program(folder: Path, tm
         cairn("serve", "check", "--data", folder, folder=tmp_path, code=1),
         cairn("serve", "check", "--data", folder, "--repair", folder=tmp_path, code=1),
         cairn("serve", "restore", tmp_path / "b.cairn", "--data", tmp_path / "new", folder=tmp_path, code=1),
+        cairn("serve", "archive", "map0", "map0.cairn", "--data", folder, folder=tmp_path, code=1),
+        cairn("serve", "compact", "--data", folder, folder=tmp_path, code=1),
         refused(folder)[1],
     ]
     for text in said:
@@ -170,6 +192,18 @@ def test_a_port_that_is_taken_says_so(tmp_path: Path) -> None:
     assert (code, "another program does; stop it, or take another --port" in said) == (1, True), said
 
 
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--tls-cert", "none.pem", "--tls-key", "none.key"], "--tls-cert none.pem, --tls-key none.key: "),
+        (["--upstream", "base:8750"], "a server's URL is http://HOST:PORT, got 'base:8750'"),
+    ],
+)
+def test_a_start_that_is_refused_makes_no_store(options: list[str], said: str, tmp_path: Path) -> None:
+    assert said in cairn("serve", "--data", "data", *options, folder=tmp_path, code=1)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_new_store_is_announced_and_one_with_maps_is_not(tmp_path: Path, folder: Path) -> None:
     (empty := tmp_path / "empty").mkdir()
     for place, words in (
@@ -194,3 +228,17 @@ def test_a_folder_of_something_else_is_refused_and_stays_as_it_is(tmp_path: Path
     assert "has no store, but other files (cat.jpg)" in said
     assert f"--data {tmp_path / 'photos' / 'cairn-data'}" in said
     assert [path.name for path in (tmp_path / "photos").iterdir()] == ["cat.jpg"]
+
+
+@pytest.mark.parametrize(
+    ("words", "way"),
+    [
+        (["backup", "nightly.cairn"], "pg_basebackup"),
+        (["restore", "nightly.cairn"], "pg_basebackup"),
+        (["compact"], "VACUUM FULL"),
+    ],
+)
+def test_commands_for_a_folder_say_what_to_do_with_a_database(words: list[str], way: str, tmp_path: Path) -> None:
+    said = cairn("serve", *words, "--store", "postgresql://cairn@database/cairn", folder=tmp_path, code=1)
+    assert f"`cairn serve {words[0]}` works on a folder (--data): " in said
+    assert way in said

@@ -4,12 +4,14 @@ from pathlib import Path
 
 import httpx
 import pytest
+from tests.fixtures.commands import cairn
 from tests.fixtures.server.database_servers import ended, folded, push, served
 from tests.fixtures.server.live import Process, until
-from tests.fixtures.server.postgres import Database
-from tests.fixtures.server.pushes import pushed
+from tests.fixtures.server.postgres import Database, PostgresServer, new_database
+from tests.fixtures.server.pushes import KEYS, pushed
 
 from cairn_map.errors import BadInputError, DamagedDataError
+from cairn_map.evidence.grid import cell_of_key
 from cairn_server.operations.serve import main
 
 __all__ = ["ended"]
@@ -60,3 +62,30 @@ def test_servers_do_not_share_a_folder_and_roles_need_a_database(
     alone = Process(tmp_path / "two", "--no-fold")
     code, said = alone.end()
     assert (code, "SQLite is one process's" in said) == (1, True), said
+
+
+def test_a_map_becomes_a_file_and_comes_back_while_servers_run(
+    newest_postgres: PostgresServer, tmp_path: Path, ended: list[Process]
+) -> None:
+    database = new_database(newest_postgres)
+    site = served(tmp_path / "site", database, ended)
+    push(site, *COMMITS)
+    until(lambda: folded(site, len(COMMITS)), "it is folded")
+    cells = cells_at(site)
+    said = cairn("serve", "archive", "lab", "lab.cairn", "--store", database.url, folder=tmp_path)
+    assert f"{len(COMMITS)} commits, {len(KEYS)} cells" in said
+    cairn("map", "delete", f"{site}/maps/lab", "--yes", folder=tmp_path)
+    assert httpx.get(f"{site}/maps/lab").status_code == 410
+    said = cairn("serve", "unarchive", "lab.cairn", "--store", database.url, folder=tmp_path)
+    assert said.startswith("map lab is in postgresql://127.0.0.1:") and "secret" not in said
+    until(lambda: httpx.get(f"{site}/maps/lab").status_code == 200, "the server knows it")
+    assert cells_at(site) == cells
+    more = pushed(3, 3)
+    httpx.put(f"{site}/maps/lab/commits/{more.id}", content=more.data).raise_for_status()
+    until(lambda: folded(site, len(COMMITS) + 1), "it is folded, after what came back")
+
+
+def cells_at(url: str) -> list[bytes]:
+    """Bytes of the cells of the map."""
+    cells = [cell_of_key(key) for key in KEYS]
+    return [httpx.get(f"{url}/maps/lab/main/cells/{cell}").raise_for_status().content for cell in cells]

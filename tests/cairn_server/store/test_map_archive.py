@@ -1,24 +1,17 @@
 """An archived map that is brought back is the map: cells, log and seals, byte for byte; its robots go on."""
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import apsw
 import pytest
+from tests.fixtures.server.archived_map import COMMITS, answers, filled, tables_of
 from tests.fixtures.server.live import Live
-from tests.fixtures.server.pushes import MOLE, WREN, pushed
+from tests.fixtures.server.pushes import pushed
 
 from cairn_map.errors import BadInputError, ConflictError, DamagedDataError, NotFoundError
-from cairn_map.wire.messages import Retract
 from cairn_server.operations.serve import main
 from cairn_server.store.sqlite.store import FILE_NAME
-from cairn_server.store.store_rows import MapRow
-
-COMMITS = [pushed(n, n + shift, author) for shift, author in enumerate((MOLE, WREN)) for n in range(3)]
-OF_STORE = {"number", "map", "commit_number", "token_hash", "may_return", "received_age_s", "folded_age_s"}
-"""Columns that are a store's own, or moved with its age."""
 
 
 @pytest.fixture
@@ -27,55 +20,11 @@ def live(tmp_path: Path) -> Iterator[Live]:
         yield server
 
 
-def filled(live: Live) -> MapRow:
-    """A map with commits of two robots, a retract, evidence that is gone, and a commit that waits for another."""
-    row = live.new_map()
-    for commit in COMMITS:
-        live.push(row, commit)
-        live.folded(row)
-    live.service.store.forget_evidence(row, before_s=1e9, limit=2)
-    live.http.post(f"/maps/{row.name}/retracts", json=Retract(commits=[str(COMMITS[4].id)]).model_dump())
-    live.http.post(f"/maps/{row.name}/branches", json={"robot": "mole", "incarnation": MOLE.incarnation})
-    live.folded(row)
-    return row
-
-
-def tables_of(folder: Path, name: str) -> dict[str, list[tuple[Any, ...]]]:
-    """All rows of a map, without what is its store's own."""
-    connection = apsw.Connection(str(folder / FILE_NAME))
-    try:
-        number = connection.execute("SELECT number FROM map WHERE name = ?", (name,)).get
-        tables = [each for (each,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
-        found = {}
-        for table in set(tables) - {"gone_map", "gone_token", "token"}:
-            columns = [each for (each,) in connection.execute("SELECT name FROM pragma_table_info(?)", (table,))]
-            own = ", ".join(each for each in columns if each not in OF_STORE)
-            where = "map = ?" if "map" in columns else "number = ?" if table == "map" else ""
-            if table == "diff":
-                where = "commit_number IN (SELECT number FROM commits WHERE map = ?)"
-            if where:
-                found[table] = sorted(
-                    connection.execute(f"SELECT {own} FROM {table} WHERE {where}", (number,)), key=repr
-                )
-        return found
-    finally:
-        connection.close()
-
-
-def answers(live: Live, row: MapRow) -> Any:
-    """Facts of a map as clients are told them."""
-    path = f"/maps/{row.name}"
-    log = live.http.get(f"{path}/log", params={"limit": 1000}).json()
-    commits = [live.http.get(f"{path}/commits/{entry['id']}") for entry in log]
-    kept = [(each.status_code, each.content, each.headers.get("Cairn-Seal")) for each in commits]
-    return json.dumps([live.http.get(path).json(), log]), kept, live.cells(live.service.store.map(row.name))
-
-
 def test_archive_then_unarchive_is_the_identity(live: Live, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     data, file = tmp_path / "data", tmp_path / "lab.cairn"
     other, row = filled(live), filled(live)
     told, others = answers(live, row), answers(live, other)
-    before = tables_of(data, row.name)
+    before = tables_of(data / FILE_NAME, row.name)
     assert main(["archive", row.name, str(file), "--data", str(data)]) == 0
     assert f"map {row.name}, 0." in capsys.readouterr().out
     assert file.stat().st_mode & 0o777 == 0o600
@@ -83,7 +32,7 @@ def test_archive_then_unarchive_is_the_identity(live: Live, tmp_path: Path, caps
     live.__exit__(None, None, None)
     assert main(["unarchive", str(file), "--data", str(data)]) == 0
     assert f"map {row.name} is in {data}: 1 maps" in capsys.readouterr().out
-    assert tables_of(data, row.name) == before
+    assert tables_of(data / FILE_NAME, row.name) == before
     with Live(data) as again:
         assert (answers(again, row), answers(again, other)) == (told, others)
         made = again.service.store.map(row.name)

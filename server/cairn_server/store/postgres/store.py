@@ -158,7 +158,7 @@ class PgStore(PgReads):
             if not made.rowcount:
                 return False
             if layer.has_epochs:
-                _bar_older_programs(connection)
+                bar_older_programs(connection)
             connection.execute(
                 "INSERT INTO head (map, log_id, seq, chain, fingerprint) VALUES (%s, %s, 0, %s, %s)",
                 (number, log_id, first_chain(log_id, layer.digest()), ZERO.to_bytes()),
@@ -280,7 +280,7 @@ class PgStore(PgReads):
         self._connections.close()
 
 
-def _bar_older_programs(connection: Connection) -> None:
+def bar_older_programs(connection: Connection) -> None:
     """Keep programs that know nothing of epochs from a store that gets its first map with them.
 
     They would take its cells for damaged. Those that start are refused by their schema; those that run are counted.

@@ -16,7 +16,7 @@ from cairn_server.store.sqlite.readers import Readers
 from cairn_server.store.sqlite.reads import SqliteReads
 from cairn_server.store.sqlite.schema import STEPS, newer_store
 from cairn_server.store.sqlite.store import SqliteStore
-from cairn_server.store.sqlite.writer import first, rows
+from cairn_server.store.sqlite.writer import connect_to_store, first, rows
 
 COMPLAINTS_MAX = 20
 KINDS = {"INTEGER": "'integer'", "REAL": "'real', 'integer'", "TEXT": "'text'", "BLOB": "'blob'"}
@@ -31,10 +31,12 @@ class SqliteArchive(SqliteStore):
 
         Raises:
             NotFoundError: kind `no_store`.
-            BadInputError: kind `store_version`: it was last opened by another version of cairn.
+            BadInputError: kind `bad_store`: it is none; `store_version`: another version of cairn opened it last.
+            UnreachableError: kind `disk_full`: there is no room to open it.
         """
         if not path.is_file():
             raise NotFoundError("no_store", f"there is no store {path}")
+        connect_to_store(path).close()
         SqliteReads.__init__(self, Readers(path))
         with self._readers.reading() as reader:
             version = reader.pragma("user_version")

@@ -18,8 +18,9 @@ from typing import BinaryIO
 import apsw
 
 from cairn_map.errors import BadInputError, ConflictError, DamagedDataError, NotFoundError
-from cairn_server.store.backup_note import note_backup
+from cairn_server.store.backup_note import NOTE_NAME, note_backup
 from cairn_server.store.folder_lock import LOCK_NAME, lock_folder
+from cairn_server.store.private_files import give_to_owner
 from cairn_server.store.sqlite.archive import check_form
 from cairn_server.store.sqlite.ended_tokens import LIST_NAME, copy_list, ended_since
 from cairn_server.store.sqlite.failures import is_full, opening_failure
@@ -62,6 +63,7 @@ def back_up(folder: Path, target: Path, report: Report) -> int:
         _copy(source, partial, report, shown=target)
     size_bytes = target.stat().st_size
     note_backup(folder, str(target.absolute()), size_bytes)
+    give_store_to_owner(folder)
     return size_bytes
 
 
@@ -87,6 +89,7 @@ def send_backup(folder: Path, stream: BinaryIO, report: Report) -> int:
     except OSError as exc:
         raise BadInputError("bad_backup", f"the backup is not whole, it cannot be written: {exc}") from exc
     note_backup(folder, "standard output", size_bytes)
+    give_store_to_owner(folder)
     return size_bytes
 
 
@@ -145,7 +148,14 @@ def restore(
             settle_file(partial)
             if old is not None and ended is not None:
                 copy_list(old / LIST_NAME, folder / LIST_NAME)
+        give_store_to_owner(folder)
     return restored
+
+
+def give_store_to_owner(folder: Path) -> None:
+    """Give what root has written of a store to the owner of its folder, as whom the server runs."""
+    names = (*(FILE_NAME + side for side in SIDES), LOCK_NAME, LIST_NAME, NOTE_NAME)
+    give_to_owner(folder / name for name in names)
 
 
 def check_backup(path: Path) -> None:

@@ -23,7 +23,7 @@ from typing import Any, TypeVar
 import apsw
 
 from cairn_map.errors import UnreachableError
-from cairn_server.store.sqlite.failures import write_failure
+from cairn_server.store.sqlite.failures import opening_failure, write_failure
 
 log = logging.getLogger(__name__)
 
@@ -70,6 +70,14 @@ def connect(path: Path) -> apsw.Connection:
     connection.execute("PRAGMA foreign_keys = ON")
     connection.execute("PRAGMA journal_size_limit = 67108864")
     return connection
+
+
+def connect_to_store(path: Path) -> apsw.Connection:
+    """`connect`, for a command that opens a store that was there; raises as `opening_failure`."""
+    try:
+        return connect(path)
+    except apsw.Error as exc:
+        raise opening_failure(exc, path) from exc
 
 
 def rows(connection: apsw.Connection, query: str, values: Values = ()) -> list[tuple[Any, ...]]:
