@@ -114,8 +114,7 @@ class Service:
     ) -> None:
         """Start the parts; without `fold_process` a thread folds, if the service is to fold at all.
 
-        `certificate` is the one of the settings, where it was read before. It is not ready until `warming` is None:
-        what the start still waits for.
+        It is not ready until `warming` is None: what the start still waits for. `certificate` was read before.
         """
         self.store = store
         self.settings = settings

@@ -4,15 +4,16 @@ import argparse
 import logging
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from cairn_map.errors import EXIT_CODES, BadInputError, ConflictError, DamagedDataError
 from cairn_map.progress import PercentLine
 from cairn_server.http.middleware.log_format import LogForm, add_log_format, fields, start_logging
 from cairn_server.operations.check import check_all
-from cairn_server.operations.folder_option import add_folder
+from cairn_server.settings import Settings
 from cairn_server.store.sqlite.archive import SqliteArchive
 from cairn_server.store.sqlite.backup import Restored, back_up, restore, send_backup
 from cairn_server.store.sqlite.files.compaction import compact
@@ -66,7 +67,7 @@ def back_up_command(argv: list[str]) -> int:
     parser = argparse.ArgumentParser(
         "cairn serve backup", description=BACKUP, epilog=EXIT_CODES, formatter_class=argparse.RawTextHelpFormatter
     )
-    add_folder(parser, instead=BACKUP_INSTEAD)
+    _add_folder(parser, instead=BACKUP_INSTEAD)
     parser.add_argument(
         "file", metavar="FILE", help="the backup; an older one of that name is replaced; -: standard output"
     )
@@ -103,7 +104,7 @@ def restore_command(argv: list[str]) -> int:
         "cairn serve restore", description=RESTORE, epilog=EXIT_CODES, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("file", type=Path, metavar="FILE", help="a file that `cairn serve backup` made")
-    add_folder(parser, instead=BACKUP_INSTEAD, what="a new or empty folder")
+    _add_folder(parser, instead=BACKUP_INSTEAD, what="a new or empty folder")
     parser.add_argument("--old", type=Path, metavar="DIR", help="folder of the server that it replaces")
     args = parser.parse_args(argv)
     progress = PercentLine("restore")
@@ -174,7 +175,7 @@ def compact_command(argv: list[str]) -> int:
     parser = argparse.ArgumentParser(
         "cairn serve compact", description=COMPACT, epilog=EXIT_CODES, formatter_class=argparse.RawTextHelpFormatter
     )
-    add_folder(parser, instead="in PostgreSQL autovacuum makes room, and VACUUM FULL gives it back to the disk")
+    _add_folder(parser, instead="in PostgreSQL autovacuum makes room, and VACUUM FULL gives it back to the disk")
     args = parser.parse_args(argv)
     try:
         found = compact(args.data)
@@ -185,3 +186,23 @@ def compact_command(argv: list[str]) -> int:
     before, after = (f"{size / 1e6:.1f} MB" for size in found)
     sys.stdout.write(f"{args.data}: {before} before, {after} now\n")
     return 0
+
+
+def _add_folder(parser: argparse.ArgumentParser, *, instead: str, what: str = "folder of the store") -> None:
+    """Add the option of the folder; `instead` is what to do for a store in PostgreSQL."""
+    parser.add_argument("--data", type=Path, default=Settings().folder, metavar="DIR", help=what)
+    for flag in ("--store", "--objects"):
+        parser.add_argument(flag, action=_OfDatabase, const=instead, help=argparse.SUPPRESS)
+
+
+class _OfDatabase(argparse.Action):
+    """Refusal of a database, for a command that works on a folder."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: str | Sequence[Any] | None,
+        option: str | None = None,
+    ) -> None:
+        raise BadInputError("bad_setting", f"`{parser.prog}` works on a folder (--data): {self.const}")

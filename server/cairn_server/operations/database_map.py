@@ -23,7 +23,7 @@ def archive_of_database(store: str, objects: str | None, name: str, target: Path
         BadInputError: kind `disk_full`; `bad_store`: there is no such database.
     """
     with _opened(store, objects) as (connections, bucket), connections.snapshot() as connection:
-        from cairn_server.store.postgres.map_file import archive_rows
+        from cairn_server.store.postgres.files.map_file import archive_rows
 
         age_s, tables = archive_rows(connection, name, bucket)
         write_archive(target, age_s, tables)
@@ -39,7 +39,7 @@ def restore_to_database(archive: Path, store: str, objects: str | None) -> tuple
         BadInputError: kind `bad_backup`: there is not one map in it; `bad_store`: there is no such database.
     """
     with _opened(store, objects) as (connections, _), opened_archive(archive) as source:
-        from cairn_server.store.postgres.map_file import put_map
+        from cairn_server.store.postgres.files.map_file import put_map
 
         return put_map(connections, lambda: archived_rows(source))
 

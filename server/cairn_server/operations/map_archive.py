@@ -55,14 +55,15 @@ def archive_command(argv: list[str]) -> int:
     parser.add_argument("map", metavar="MAP", help="name of the map")
     parser.add_argument("file", type=Path, metavar="FILE", help="the archive; an older one of that name is replaced")
     args = parser.parse_args(argv)
-    source = _store_in(args.data) if args.store is None else None
+    store: str | None = args.store
+    source = _store_in(args.data) if store is None else None
     if args.file.exists() and ((source and args.file.samefile(source)) or not is_backup(args.file)):
         raise BadInputError("bad_backup", f"{args.file} is there and is no archive; choose another name")
     with partial_file(args.file) as partial:
-        if source is not None:
-            archive_map(source, args.map, partial)
+        if store is not None:
+            archive_of_database(store, args.objects, args.map, partial)
         else:
-            archive_of_database(args.store, args.objects, args.map, partial)
+            archive_map(_store_in(args.data), args.map, partial)
         settle_file(partial)
         summary = verified(partial)
     size_mb = args.file.stat().st_size / 1e6

@@ -13,7 +13,7 @@ from tests.fixtures.server.settled_store import ColdStore, SwitchedBucket
 from cairn_map.errors import ConflictError, NotFoundError
 from cairn_server.operations.serve import main
 from cairn_server.store.postgres.connections import Connections
-from cairn_server.store.postgres.map_file import archive_rows
+from cairn_server.store.postgres.files.map_file import archive_rows
 from cairn_server.store.postgres.store import PgStore
 from cairn_server.store.sqlite.backup import settle_file
 from cairn_server.store.sqlite.files.map_archive import write_archive
