@@ -147,7 +147,6 @@ class Service:
             )
         self.maps = Maps(store, self.live, self.reports, settings.memory, on_delete=self._clear_deleted)
         self.maps.warn_of_large_cells()
-
         DECODING.limit_bytes = settings.memory.decoding_bytes
         remove_spools(settings.folder)
         upstream = UpstreamProgress(store.age, settings.upstream, store.replicas)
