@@ -31,6 +31,7 @@ TABLES = (
     "retracted",
     "cell",
     "tile",
+    "mark",
     "held",
     "author",
     "vector_mark",
