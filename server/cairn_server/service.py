@@ -58,6 +58,8 @@ from cairn_server.sync.admissions import Admissions
 from cairn_server.sync.clock_trust import ClockTrust
 from cairn_server.sync.handing_over import UpstreamProgress
 from cairn_server.sync.held_commits import HeldCommits, WantedCommits
+from cairn_server.sync.marking import Marking
+from cairn_server.sync.operator_commits import OperatorCommits
 from cairn_server.sync.pushes import Pushes
 from cairn_server.sync.replies import MainReplies, StableVectors
 from cairn_server.sync.retracting import Retracts
@@ -83,6 +85,7 @@ class SyncParts:
     pushes: Pushes
     uploads: Uploads
     retracts: Retracts
+    marking: Marking
     replies: MainReplies
     held: HeldCommits
     upstream: UpstreamProgress
@@ -175,13 +178,14 @@ class Service:
             self._wake_folding()
             upstream.wake()
 
-        admissions = Admissions(store, settings.quotas)
+        admissions, commits = Admissions(store, settings.quotas), OperatorCommits(store)
         pushes = Pushes(store, settings, self.live, wanted, admissions, self.clock, on_new=on_new)
         return SyncParts(
             admissions,
             pushes,
             Uploads(store, pushes),
-            Retracts(store, wanted, on_new=on_new),
+            Retracts(store, commits, wanted, on_new=on_new),
+            Marking(store, commits, on_new=on_new),
             MainReplies(
                 store,
                 self.cells,

@@ -30,6 +30,7 @@ from tests.bench.integration import integration_rows
 from tests.bench.large_map import large_map_rows
 from tests.bench.links import link_rows
 from tests.bench.many_maps import many_map_rows
+from tests.bench.marks import mark_rows
 from tests.bench.overlay import overlay_rows
 from tests.bench.peers import peer_rows
 from tests.bench.queries import query_rows
@@ -283,6 +284,7 @@ PARTS: dict[str, Callable[[bool], Iterator[Row]]] = {
     "imports": import_rows,
     "integration": integration_rows,
     "links": link_rows,
+    "marks": mark_rows,
     "overlay": overlay_rows,
     "peers": peer_rows,
     "queries": query_rows,

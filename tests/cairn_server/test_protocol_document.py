@@ -8,6 +8,7 @@ from tests.fixtures.server.live import Live
 from tests.fixtures.server.protocol_document import DOCUMENT, ROOT, ROUTE, documented_kinds, routes_of
 
 from cairn_map.commits.commit import COMMIT_BYTES_MAX, RETRACTS_MAX
+from cairn_map.commits.mark import MARKS_MAX
 from cairn_map.files import octomap
 from cairn_map.render import render_request
 from cairn_map.wire import live_events
@@ -103,6 +104,9 @@ def test_the_statuses_in_the_document_are_those_of_the_code(kind: str) -> None:
         ("until a ticket ends", export_tickets.TICKET_S),
         ("header `Cairn-Coverage`", cell_routes.COVERAGE_BYTES_MAX),
         ("cells in one live event", live_events.CELLS_MAX),
+        ("marks in one live event", live_events.MARKS_MAX),
+        ("marks of one commit", MARKS_MAX),
+        ("marks of one robot on a map that are not taken out", shares.MARKS_OF_ROBOT_MAX),
         ("values in one JSON text", JSON_VALUES_MAX),
         ("problem's `detail`", problems.DETAIL_CHARACTERS_MAX),
         ("until a request's head is whole", Settings().head_s),

@@ -1,10 +1,10 @@
-"""Stored bytes of format versions 1 and 2: made once, kept for ever.
+"""Stored bytes of format versions 1 to 3: made once, kept for ever.
 
     python -m tests.formats.make_formats
 
 writes the files that are missing, never over one that is there: if the code writes other bytes today, the old ones
-must still decode. What they decode to is in `v1.json` and `v2.json`. `before-epochs.*.zst` are a store, a backup and a
-robot's folder of the last version without epochs.
+must still decode. What they decode to is in `v1.json`, `v2.json` and `v3.json`. `before-epochs.*.zst` are a store, a
+backup and a robot's folder of the last version without epochs.
 """
 
 import json
@@ -18,6 +18,7 @@ from cairn_map.codec.history_code import decode_history, encode_history
 from cairn_map.commits.commit import CommitMeta, ScanPose, make_commit
 from cairn_map.commits.commit_reading import open_commit
 from cairn_map.commits.cursor import Cursor
+from cairn_map.commits.mark import make_mark
 from cairn_map.epochs.cell_history import CellHistory, cell_history, history_fingerprint
 from cairn_map.epochs.epoch import BASE, Epoch
 from cairn_map.epochs.layer import MapLayer
@@ -105,6 +106,16 @@ def epoch_commit_bytes() -> bytes:
     return make_commit(meta, {KEY: evidence(), cell_key((0, 0, 0)): wall()}, LAYER).data
 
 
+def mark_commit_bytes() -> bytes:
+    """A commit with two marks that takes the place of another one."""
+    lamp = make_mark(kind="hot_spot", name="Lampe größer", at_m=(1.25, -2.0, 0.4), time_s=1.5e9, note="two\nlines")
+    door = make_mark(kind="door", name="door", at_m=(0.0, 0.0, 1.0), extent_m=(0.9, 0.1, 2.0), time_s=1.5e9, by="ada")
+    meta = CommitMeta(
+        id=f"{AUTHOR}.9", geometry=GEOMETRY.digest().hex(), retracts=(f"{AUTHOR}.5",), marks=(lamp, door), note="n"
+    )
+    return make_commit(meta, {}, GEOMETRY).data
+
+
 def cursor(seq: int) -> Cursor:
     """A made-up place in a made-up log."""
     return Cursor(bytes(range(16)), seq, bytes(range(16, 32)))
@@ -142,6 +153,7 @@ def made() -> dict[str, bytes]:
         "v2-fast.cell": encode_history(KEY, history(), LAYER).data,
         "v2-small.cell": encode_history(KEY, history(), LAYER, profile=Profile.SMALL).data,
         "v2.commit": epoch_commit_bytes(),
+        "v3.commit": mark_commit_bytes(),
     }
 
 
@@ -151,7 +163,7 @@ def found() -> dict[str, object]:
     commit, _ = open_commit((FOLDER / "v1.commit").read_bytes())
     frames = frames_of((FOLDER / "v1.reply").read_bytes())
     payloads = [frame for frame in frames if isinstance(frame, CellFrame) and frame.payload]
-    meta = json.loads(commit.meta.model_dump_json(exclude={"layers", "epoch"}))  # fields of version 2 alone
+    meta = json.loads(commit.meta.model_dump_json(exclude={"layers", "epoch", "marks"}))  # fields of later versions
     return {
         "geometry": GEOMETRY.digest().hex(),
         "digests": {name: cell.digest.hex() for name, cell in cells.items()},
@@ -174,8 +186,14 @@ def found_with_epochs() -> dict[str, object]:
             name: history_fingerprint(cell.history, cell.key, layer_word=LAYER.word).hex()
             for name, cell in cells.items()
         },
-        "commit": {"sha": commit.sha.hex(), "meta": json.loads(commit.meta.model_dump_json())},
+        "commit": {"sha": commit.sha.hex(), "meta": json.loads(commit.meta.model_dump_json(exclude={"marks"}))},
     }
+
+
+def found_with_marks() -> dict[str, object]:
+    """What the stored bytes of version 3 say today."""
+    commit, _ = open_commit((FOLDER / "v3.commit").read_bytes())
+    return {"commit": {"sha": commit.sha.hex(), "meta": json.loads(commit.meta.model_dump_json())}}
 
 
 def main() -> None:
@@ -187,6 +205,8 @@ def main() -> None:
         (FOLDER / "v1.json").write_text(json.dumps(found(), indent=1, sort_keys=True) + "\n")
     if not (FOLDER / "v2.json").exists():
         (FOLDER / "v2.json").write_text(json.dumps(found_with_epochs(), indent=1, sort_keys=True) + "\n")
+    if not (FOLDER / "v3.json").exists():
+        (FOLDER / "v3.json").write_text(json.dumps(found_with_marks(), indent=1, sort_keys=True) + "\n")
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from tests.formats.make_formats import (
     evidence,
     found,
     found_with_epochs,
+    found_with_marks,
     history,
     wall,
 )
@@ -65,3 +66,7 @@ def test_stored_cells_with_epochs_hold_their_rows_for_both_decoders(name: str) -
     decoded = decode_history(data)
     assert (decoded.key, decoded.layer, decoded.history) == (KEY, LAYER, history())
     assert naive_history.decode_history(data)[0]["digest"] == decoded.digest
+
+
+def test_stored_bytes_with_marks_still_mean_what_they_meant() -> None:
+    assert found_with_marks() == json.loads((FOLDER / "v3.json").read_text())

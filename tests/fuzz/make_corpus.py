@@ -18,6 +18,7 @@ from pydantic import BaseModel
 from tests.fixtures.map.made import GEOMETRIES, KEY, MIDDLE, PLAIN, ROBOT, SMALL, made_commit, made_cursor, made_frames
 from tests.fixtures.map.made import random_evidence as made_evidence
 from tests.fixtures.map.stored import recoded
+from tests.formats.make_formats import mark_commit_bytes
 from tests.fuzz.foreign_corpus import foreign_seeds
 from tests.fuzz.sections import joined
 
@@ -120,6 +121,7 @@ def seeds() -> Iterator[tuple[str, str, bytes]]:
     """Target, name and bytes of each."""
     yield from _cells()
     yield "commit", "two-cells", made_commit().data
+    yield "commit", "marks", mark_commit_bytes()
     yield "commit", "retract", made_commit(retracts=(f"{ROBOT}.7",), note="größer", seen=str(made_cursor())).data
     for n, frame in enumerate(made_frames()):
         yield "reply", f"frame-{n}", start_of_reply() + encode_frame(frame)

@@ -133,7 +133,8 @@ def read_commit(data: bytes) -> None:
         check_evidence(key, cell.evidence, cell.geometry)
     meta, bodies = split_commit(data)
     assert (meta, bodies) == (commit.meta, commit.cells)
-    assert commit.sha == commit_sha(commit.text, [cell.digest for cell in cells.values()])
+    digests = [cell.digest for cell in cells.values()]
+    assert commit.sha == commit_sha(commit.text, digests, version=commit.meta.version)
     other = commit.id._replace(n=commit.id.n ^ 1)
     renamed = renamed_commit(data, commit=other, parent=None, retracts=())
     opened, _ = open_commit(renamed.data, evidence_bytes_max=EVIDENCE_BYTES_MAX)

@@ -22,6 +22,7 @@ from cairn_server.store.shares import (
     RESERVE,
     Tops,
     account_of,
+    check_marks,
     check_reserve,
     check_sums,
     used_part,
@@ -135,6 +136,8 @@ class MemoryMap:
         self._check_sums(commit)
         admit_commit(self.keys, commit.id.author, commit.grounds)
         top, _ = self.authors.get(commit.id.author, (0, 0))
+        if commit.marks:
+            check_marks(commit, self._held_marks(commit.id.author.robot))
         self.authors[commit.id.author] = max(top, commit.id.n), intervals
         self.commits[commit.id] = Kept(
             number=len(self.ids),
@@ -273,6 +276,11 @@ class MemoryMap:
         )
         check_number(commit, numbering)
         return intervals + 1 - neighbours
+
+    def _held_marks(self, robot: str) -> int:
+        """Marks of a robot that are not taken out."""
+        own = (kept for commit, kept in self.commits.items() if commit.author.robot == robot)
+        return sum(len(kept.new.marks) for kept in own if not kept.unfolded_seq)
 
     def shares(self) -> list[RobotShares]:
         """What every robot, and the reserve, has of its shares."""

@@ -9,6 +9,7 @@ from tests.memory_store.map import Kept, MemoryMap
 
 from cairn_map.commits.cursor import ENTRY_FOLD, Cursor, first_chain
 from cairn_map.commits.ids import Author, CommitId
+from cairn_map.commits.mark import MarkKey
 from cairn_map.commits.version_vector import EMPTY, VersionVector
 from cairn_map.evidence.fingerprint import ZERO, Fingerprint
 from cairn_map.evidence.grid import CellKey, cell_of_key
@@ -19,9 +20,12 @@ from cairn_server.store.store_rows import (
     ChainedEntry,
     Contribution,
     Entry,
+    MarkBox,
+    MarkChange,
     NamedCommit,
     Selection,
     Totals,
+    overlap,
 )
 from cairn_server.store.tiles import Box
 
@@ -85,6 +89,22 @@ class MemorySnapshot:
         """The bytes of a commit's evidence in a cell; None if they are not kept any more."""
         kept = self._state.commits.get(commit)
         return kept.new.diff.get(key) if kept else None
+
+    def marks(self, *, after_seq: int, limit: int, box: MarkBox | None = None) -> list[MarkChange]:
+        """Marks that changed after a log entry, in a box, oldest first: whole entries, with `limit` marks or more."""
+        found = [
+            MarkChange(
+                seq=kept.unfolded_seq or kept.folded_seq,
+                key=MarkKey(kept.new.id, number),
+                record=None if kept.unfolded_seq else mark.to_json(),
+                amends=kept.new.retracts,
+            )
+            for kept in self._folded()
+            for number, mark in enumerate(kept.new.marks)
+            if kept.folded_seq is not None and (box is None or overlap(mark.low_mm, mark.high_mm, box))
+        ]
+        found = sorted((change for change in found if change.seq > after_seq), key=lambda change: change.seq)
+        return [change for change in found if change.seq <= found[min(limit, len(found)) - 1].seq]
 
     def tip(self, author: Author) -> tuple[int, bytes] | None:
         """Highest folded number of an author and its SHA-256."""

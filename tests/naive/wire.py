@@ -14,7 +14,7 @@ def commit_parts(data: bytes) -> tuple[bytes, list[bytes], bytes]:
     file = io.BytesIO(data)
     assert file.read(4) == b"CRCM"
     version = file.read(1)[0]
-    assert version in (1, 2)
+    assert version in (1, 2, 3)
     (meta_bytes,) = struct.unpack("<I", file.read(4))
     meta = file.read(meta_bytes)
     (count,) = struct.unpack("<I", file.read(4))

@@ -10,6 +10,14 @@ from tests.fixtures.client.made import cells_of
 from tests.memory_store import map as memory_map
 from tests.sync_sim.events import Events
 from tests.sync_sim.joined import JoinedHistory, any_epoch, layer_of
+from tests.sync_sim.marks import (
+    MarkFollower,
+    any_marks,
+    has_marks,
+    mark_as_operator,
+    marks_by_definition,
+    marks_of,
+)
 from tests.sync_sim.network import Network, Weather
 from tests.sync_sim.robot import SimRobot
 from tests.sync_sim.server import FoldOnRequest, SimServer, with_more
@@ -18,6 +26,7 @@ from cairn_client.replica.server_cells import ServerCells
 from cairn_client.sync.exchange import MISFIT, Exchange
 from cairn_map.commits import ids
 from cairn_map.commits.ids import OPERATOR, CommitId
+from cairn_map.commits.mark import Mark
 from cairn_map.epochs.cell_history import history_fingerprint
 from cairn_map.epochs.epoch import Epoch
 from cairn_map.evidence.fingerprint import ZERO
@@ -63,6 +72,8 @@ class History:
         self._more = Random(f"{seed} more")
         self._log = log
         self._notes = 0
+        self._has_marks = has_marks(seed)
+        self._follower = MarkFollower()
         self.clock_s = 1.7e9
         """What clocks are ahead of virtual time."""
         self._events = Events()
@@ -102,20 +113,25 @@ class History:
     def _step(self, name: str) -> None:
         self._log(f"{self._events.now_s:6.1f} s  {name}")
         getattr(self, f"_{name}")()
+        if self._has_marks:
+            self._mark()
         self._check_bases()
         self._more.choice(self._robots).check_view()
 
     # What can happen
 
     def _commit(self) -> None:
-        self._mapper().commit(self._random.randrange(60), note=self._note(), epoch=self._epoch())
+        self._mapper().commit(
+            self._random.randrange(60), note=self._note(), epoch=self._epoch(), marks=self._some_marks()
+        )
 
     def _amend(self) -> None:
         robot = self._mapper()
         own = [commit for commit in robot.notes() if commit.author.robot == robot.name]
         if own:
             taken_back = with_more(str(self._random.choice(own)), map(str, own), self._more)
-            robot.commit(self._random.randrange(60), note=self._note(), retracts=taken_back, epoch=self._epoch())
+            seed, note, epoch = self._random.randrange(60), self._note(), self._epoch()
+            robot.commit(seed, note=note, retracts=taken_back, epoch=epoch, marks=self._some_marks())
 
     def _sync(self) -> None:
         robot = self._random.choice(self._robots)
@@ -187,6 +203,13 @@ class History:
         """An operator lets in the robots that lost their disks, some time after they came with another key."""
         self._server.admit_all()
 
+    def _mark(self) -> None:
+        """An operator marks, and a client that follows the marks asks what is new."""
+        if self._more.random() < 0.2:
+            mark_as_operator(self._server, self._more)
+        if self._more.random() < 0.5:
+            self._follower.follow(self._server, self._more)
+
     # What must hold
 
     def _check_bases(self) -> None:
@@ -219,6 +242,9 @@ class History:
         assert all(self._server.is_retracted(target) for target in sealed), "what an operator took out is back"
         expected = cells_of(self._server.sum_of_commits())
         assert self._server.cells() == expected, "the server's map is not the sum of its commits"
+        marks = marks_by_definition(self._server)
+        assert marks_of(self._server) == marks, "the server lists other marks than its commits brought"
+        assert self._follower.followed(self._server) == marks, "who follows the marks has others"
         for robot in self._robots:
             assert cells_of(robot.replica.view) == expected, f"{robot.name} has another map than the server"
             assert not robot.replica.push_set(), f"{robot.name} has commits that the server did not take"
@@ -246,6 +272,9 @@ class History:
 
     def _mapper(self) -> SimRobot:
         return self._random.choice(self._mappers)
+
+    def _some_marks(self) -> tuple[Mark, ...]:
+        return any_marks(self._more) if self._has_marks else ()
 
     def _epoch(self) -> Epoch | None:
         return any_epoch(self._layer, self._more, self.time_s())

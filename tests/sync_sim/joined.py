@@ -9,6 +9,14 @@ from random import Random
 
 from tests.fixtures.client.made import PLAIN, WITH_EPOCHS, cells_of
 from tests.sync_sim.events import Events
+from tests.sync_sim.marks import (
+    MarkFollower,
+    any_marks,
+    has_marks,
+    mark_as_operator,
+    marks_by_definition,
+    marks_of,
+)
 from tests.sync_sim.network import Network, Weather
 from tests.sync_sim.relay import Bag, SimEnd, SimRelay
 from tests.sync_sim.robot import SimRobot
@@ -16,6 +24,7 @@ from tests.sync_sim.server import SimServer, with_more
 
 from cairn_client.sync.requests import Ask
 from cairn_map.commits.ids import OPERATOR, CommitId
+from cairn_map.commits.mark import Mark
 from cairn_map.epochs.cell_history import history_fingerprint
 from cairn_map.epochs.epoch import Epoch, epoch_of
 from cairn_map.epochs.layer import MapLayer
@@ -72,6 +81,8 @@ class JoinedHistory:
         self._more = Random(f"{seed} more")
         self._log = log
         self._notes = 0
+        self._has_marks = has_marks(seed)
+        self._follower = MarkFollower()
         self._has_forgotten = False
         self._keys: dict[str, None] = {}
         self._events = Events()
@@ -123,6 +134,8 @@ class JoinedHistory:
     def _step(self, name: str) -> None:
         self._log(f"{self._events.now_s:6.1f} s  {name}")
         getattr(self, f"_{name}")()
+        if self._has_marks:
+            self._mark()
         self._check_bases()
         self._more.choice(self._robots).check_view()
 
@@ -130,14 +143,15 @@ class JoinedHistory:
 
     def _commit(self) -> None:
         robot, seed = self._random.choice(self._mappers), self._random.randrange(60)
-        robot.commit(seed, note=self._note(), epoch=self._epoch())
+        robot.commit(seed, note=self._note(), epoch=self._epoch(), marks=self._some_marks())
 
     def _amend(self) -> None:
         robot = self._random.choice(self._mappers)
         own = [commit for commit in robot.notes() if commit.author.robot == robot.name]
         if own:
             taken_back = with_more(str(self._random.choice(own)), map(str, own), self._more)
-            robot.commit(self._random.randrange(60), note=self._note(), retracts=taken_back, epoch=self._epoch())
+            seed, note, epoch = self._random.randrange(60), self._note(), self._epoch()
+            robot.commit(seed, note=note, retracts=taken_back, epoch=epoch, marks=self._some_marks())
 
     def _sync(self) -> None:
         self._random.choice(self._robots).start_round()
@@ -242,6 +256,13 @@ class JoinedHistory:
         """An operator of one server lets in the robots that came to it with another key."""
         self._random.choice(self._servers).admit_all()
 
+    def _mark(self) -> None:
+        """An operator of some server marks, and a client that follows the marks of any server asks what is new."""
+        if self._more.random() < 0.2:
+            mark_as_operator(self._more.choice(self._servers), self._more)
+        if self._more.random() < 0.5:
+            self._follower.follow(self._more.choice(self._servers), self._more)
+
     # What must hold
 
     def _check_bases(self) -> None:
@@ -281,6 +302,9 @@ class JoinedHistory:
         expected = cells_of(self._servers[0].sum_of_commits())
         for n, server in enumerate(self._servers):
             assert server.cells() == expected, f"server {n} has another map than the sum of commits"
+            marks = marks_by_definition(server)
+            assert marks_of(server) == marks == marks_of(self._servers[0]), f"server {n} has other marks"
+            assert self._follower.followed(server) == marks, "who follows the marks has others"
         for robot in self._robots:
             assert cells_of(robot.replica.view) == expected, f"{robot.name} has another map than the servers"
         self._log(f"settled with {len(held)} commits in {len(expected)} cells")
@@ -351,6 +375,9 @@ class JoinedHistory:
 
     def _finish(self, robot: SimRobot) -> None:
         self._events.run_while(lambda: robot.is_busy)
+
+    def _some_marks(self) -> tuple[Mark, ...]:
+        return any_marks(self._more) if self._has_marks else ()
 
     def _epoch(self) -> Epoch | None:
         return any_epoch(self._layer, self._more, self.time_s())

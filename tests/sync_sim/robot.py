@@ -19,6 +19,7 @@ from cairn_client.sync.sync import fetch_cells, fetch_missing, push_commits
 from cairn_client.sync.uploads import PARTS, Parts
 from cairn_map.commits.commit import split_commit
 from cairn_map.commits.ids import CommitId, commit_id_from_text
+from cairn_map.commits.mark import Mark
 from cairn_map.epochs.epoch import Epoch
 from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import CairnError
@@ -78,10 +79,19 @@ class SimRobot:
         """Whether this round is under way: to any other, an answer comes too late."""
         return number in self._conversations
 
-    def commit(self, seed: int, *, note: str, retracts: tuple[str, ...] = (), epoch: Epoch | None = None) -> None:
-        """Map something, in an epoch."""
-        facts = CommitFacts(retracts=tuple(map(commit_id_from_text, retracts)), note=note, epoch=epoch)
-        self.replica.commit(random_diff(seed), facts)
+    def commit(
+        self,
+        seed: int,
+        *,
+        note: str,
+        retracts: tuple[str, ...] = (),
+        epoch: Epoch | None = None,
+        marks: tuple[Mark, ...] = (),
+    ) -> None:
+        """Map something, in an epoch; or mark."""
+        targets = tuple(map(commit_id_from_text, retracts))
+        facts = CommitFacts(retracts=targets, note=note, epoch=epoch, marks=marks)
+        self.replica.commit({} if marks else random_diff(seed), facts)
 
     def check_view(self) -> None:
         """What the view shows is what a robot that starts now on a copy of this disk would show."""

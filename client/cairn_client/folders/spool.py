@@ -32,7 +32,7 @@ Stamp = tuple[int, int]
 """Identity of a recording's header file: its inode, and the time when it was written, ns."""
 
 
-class Mark(BaseModel):
+class SpoolMark(BaseModel):
     """Progress of the mapping of a recording."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -55,7 +55,7 @@ class Stop:
     scans: range
     """Indices in the recording."""
     done: int
-    """Measurements, or scans, of the recording that are done with this one; see `Mark.stops`."""
+    """Measurements, or scans, of the recording that are done with this one; see `SpoolMark.stops`."""
     left_out: int
     """Measurements before it that were left out."""
 
@@ -74,7 +74,7 @@ class Stop:
 
     def _mark(self, *, left_out: int) -> Mapping[str, str]:
         is_done = self.scans.stop == len(self.source)
-        mark = Mark(first_s=self.source.files[0].time_s, stops=self.done, is_done=is_done, left_out=left_out)
+        mark = SpoolMark(first_s=self.source.files[0].time_s, stops=self.done, is_done=is_done, left_out=left_out)
         return {_key(self.folder): mark.model_dump_json()}
 
 
@@ -191,12 +191,12 @@ def _stamp(folder: Path) -> Stamp | None:
     return found.st_ino, found.st_mtime_ns
 
 
-def _mark(replica: Replica, folder: Path, first_s: float) -> Mark:
-    """Mark of the recording that begins at this time; another one's, under the same name, does not count."""
+def _mark(replica: Replica, folder: Path, first_s: float) -> SpoolMark:
+    """SpoolMark of the recording that begins at this time; another one's, under the same name, does not count."""
     text = replica.store.get(_key(folder))
     with translate_damage(replica.store.file):
-        mark = Mark.model_validate_json(text) if text else None
-    return mark if mark is not None and mark.first_s == first_s else Mark(first_s=first_s, stops=0, is_done=False)
+        mark = SpoolMark.model_validate_json(text) if text else None
+    return mark if mark is not None and mark.first_s == first_s else SpoolMark(first_s=first_s, stops=0, is_done=False)
 
 
 def _key(folder: Path) -> str:

@@ -53,6 +53,7 @@ from cairn_map.wire.access_messages import (
 from cairn_map.wire.change_messages import ChangesAnswer
 from cairn_map.wire.frames import FRAME_BYTES_MAX, JSON_BYTES_MAX, Frame
 from cairn_map.wire.hottest_messages import HottestAnswer
+from cairn_map.wire.mark_messages import MarkPage, MarkReceipt, MarkRequest
 from cairn_map.wire.messages import (
     INDEX_PAGE,
     BranchInfo,
@@ -398,6 +399,17 @@ class MapApi:
         """The occupied voxels of the highest temperature; a box is x0, y0, z0, x1, y1, z1 in metres."""
         params = {"count": str(count)} | ({"box": ",".join(map(str, box_m))} if box_m else {})
         return message_from_json(HottestAnswer, self._ask("GET", f"/maps/{name}/main/hottest", params=params))
+
+    def marks(self, name: str, *, box_m: Sequence[float] | None = None, after: str | None = None) -> MarkPage:
+        """A page of the marks of a map, or of a box in metres; all: `mark_pages.mark_pages`."""
+        asked = {"box": ",".join(map(str, box_m)) if box_m else None, "after": after}
+        params = {key: value for key, value in asked.items() if value is not None}
+        return message_from_json(MarkPage, self._ask("GET", f"/maps/{name}/main/marks", params=params))
+
+    def put_mark(self, name: str, request: MarkRequest) -> MarkReceipt:
+        """Add, change or remove a mark, as an operator."""
+        body = self._ask("POST", f"/maps/{name}/main/marks", content=request.model_dump_json().encode())
+        return message_from_json(MarkReceipt, body)
 
     def vector_at(self, name: str, cursor: str) -> VersionVector:
         """The ids that a server had folded at a cursor."""

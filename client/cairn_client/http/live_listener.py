@@ -17,7 +17,7 @@ from cairn_map.errors import DamagedDataError, UnreachableError, first_error
 from cairn_map.wire.live_events import LIVE_EVENT, LiveEvent
 from cairn_map.wire.messages import check_json_size
 
-TYPES = frozenset(["hello", "cells", "log", "head", "robot", "beat"])
+TYPES = frozenset(["hello", "cells", "marks", "log", "head", "robot", "beat"])
 
 
 @dataclass(frozen=True, slots=True)

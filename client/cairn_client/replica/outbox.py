@@ -31,6 +31,7 @@ from cairn_map.codec.layer_code import decode_row
 from cairn_map.commits.commit import Commit, CommitMeta, ScanPose, make_commit, renamed_commit, split_commit
 from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.ids import Author, CommitId, RobotName
+from cairn_map.commits.mark import Mark
 from cairn_map.commits.signature import Signature
 from cairn_map.commits.version_vector import EMPTY, VersionVector
 from cairn_map.epochs.cell_history import CellHistory, cell_history
@@ -45,6 +46,8 @@ log = logging.getLogger(__name__)
 
 READ_LAST_BYTES_MAX = 8 << 20
 """Bytes of commits that stay in memory after they were read."""
+MARKS_KEY = "marks"
+"""First word of the key of what is remembered of a commit with marks."""
 NO_NOTES: Mapping[str, str] = MappingProxyType({})
 
 
@@ -68,6 +71,8 @@ class CommitFacts:
     """Own commits that this one takes back and stands for."""
     note: str = ""
     """Up to 1024 characters for the map's log."""
+    marks: tuple[Mark, ...] = ()
+    """Marks; then it has no evidence."""
 
     def meta(self, commit: CommitId, layer: MapLayer, *, parent: str | None, seen: Cursor | None) -> CommitMeta:
         """The commit's meta.
@@ -75,12 +80,14 @@ class CommitFacts:
         Raises:
             BadInputError: kind `bad_meta`: a note that is too long, or more commits than one can take back.
         """
+        # A commit with marks names the grid alone, whatever the map's epochs are.
+        has_layers = layer.has_epochs and not self.marks
         try:
             return CommitMeta(
                 id=str(commit),
-                geometry=None if layer.has_epochs else layer.geometry.digest().hex(),
-                layers=layer.identities,
-                epoch=self.epoch if layer.has_epochs and self.epoch != BASE else None,
+                geometry=None if has_layers else layer.geometry.digest().hex(),
+                layers=layer.identities if has_layers else (),
+                epoch=self.epoch if has_layers and self.epoch != BASE else None,
                 parent=parent,
                 seen=None if seen is None else str(seen),
                 captured_s=self.captured_s,
@@ -90,6 +97,7 @@ class CommitFacts:
                 integrator=self.integrator,
                 retracts=tuple(str(target) for target in self.retracts),
                 note=self.note,
+                marks=self.marks,
             )
         except ValidationError as exc:
             raise BadInputError("bad_meta", f"the commit cannot say this of itself: {first_error(exc)}") from exc
@@ -208,6 +216,7 @@ class Outbox:
                 self._store.put(key, text)
             if record is not None:
                 self.amends.put(commit.id, record)
+            self._note_marks(commit)
             self._put_successor(commit)
         # Memory follows the disk, so that a transaction that failed leaves no trace.
         self._note(_kept(commit))
@@ -264,9 +273,14 @@ class Outbox:
         return commit in self._commits
 
     def has_evidence(self, commit: CommitId) -> bool:
-        """False if a commit is known to hold none."""
+        """False if a commit is known to hold none, nor marks."""
         kept = self._commits.get(commit)
-        return kept is None or bool(kept.cells)
+        return kept is None or bool(kept.cells) or self._store.get(f"{MARKS_KEY} {commit}") is not None
+
+    def meta(self, commit: CommitId) -> CommitMeta | None:
+        """Meta of a commit; None if its bytes are not kept any more."""
+        data = self._store.commit_data(commit)
+        return split_commit(data)[0] if data else None
 
     def seal(self, commit: CommitId) -> str | None:
         """The seal that a kept commit bears."""
@@ -332,6 +346,7 @@ class Outbox:
         with self._store.transaction():
             self._store.remove_commit(commit)
             self._store.add_commit(renamed)
+            self._note_marks(renamed)
             self._set_next(n + 1, renamed)
             for amend in amends:
                 self._store.replace_commit(amend)
@@ -343,6 +358,11 @@ class Outbox:
             self._note(_kept(changed))
         self._read_successors(renamed.meta.retracted_ids)
         return renamed
+
+    def _note_marks(self, commit: Commit) -> None:
+        """Remember of an edit that it brought marks: it may be taken out when its bytes are gone."""
+        if commit.meta.marks and commit.meta.retracts:
+            self._store.put(f"{MARKS_KEY} {commit.id}", "")
 
     def _naming(self, old: CommitId, new: CommitId) -> Iterator[Commit]:
         """Commits that retract a renamed one, with its new id in them; on the server the old id is another commit's.

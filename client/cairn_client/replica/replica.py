@@ -21,13 +21,14 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_client.replica.limits import KEEP_ACKED_S
+from cairn_client.replica.mark_copy import MarkCopy
 from cairn_client.replica.outbox import NO_FACTS, NO_NOTES, CommitFacts, Outbox
 from cairn_client.replica.replica_state import ReplicaState
 from cairn_client.replica.replica_store import BaseCell, KeptCommit, ReplicaStore
 from cairn_client.replica.server_cells import ServerCells, is_to_be_taken
 from cairn_map.codec.cell_code import Profile
-from cairn_map.commits.commit import Commit
-from cairn_map.commits.cursor import Cursor
+from cairn_map.commits.commit import Commit, CommitMeta
+from cairn_map.commits.cursor import Cursor, cursor_from_text
 from cairn_map.commits.ids import OPERATOR, Author, CommitId, RobotName
 from cairn_map.commits.signature import Signature
 from cairn_map.commits.version_vector import EMPTY
@@ -137,6 +138,8 @@ class Replica:
         self._lock = threading.RLock()
         self.store = store
         self.state = ReplicaState(store)
+        self.marks = MarkCopy(store)
+        """Marks of the server's map."""
         self.layer = MapLayer(geometry=geometry, epoch_s=epoch_s)
         self._keep_acked_s = keep_acked_s
         self._memory_bytes_max = memory_bytes_max
@@ -319,6 +322,18 @@ class Replica:
         """Commits that the server may lack, oldest first."""
         with self._lock:
             return self.outbox.push_set(self.header)
+
+    def waiting_metas(self) -> list[CommitMeta]:
+        """Metas of the own commits without cells that the copy of the marks may not know yet, oldest first."""
+        with self._lock:
+            copied = self.marks.cursor
+            # A copy that was left behind: what the header covers may not be in it.
+            is_behind = (
+                copied is None or self.header is None or cursor_from_text(copied).seq < self.header.to_cursor.seq
+            )
+            covered = EMPTY if is_behind or self.header is None else self.header.coverage
+            ids = [kept.id for kept in self.outbox if not kept.cells and kept.seal is None and kept.id not in covered]
+            return [meta for commit in ids if (meta := self.outbox.meta(commit)) is not None]
 
     def behind(self) -> tuple[int, int]:
         """Number of own commits that the server may lack, and of those that it has, but not in its map yet."""

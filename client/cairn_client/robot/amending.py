@@ -1,4 +1,4 @@
-"""Amends: measurements integrated again when a pose graph corrects the poses of their scans.
+"""Amends: measurements integrated again when a pose graph corrects the poses of their scans; and marks.
 
     C  the measurement's commit             scans kept under C
     M  names C, with the new evidence       scans kept under M from here on: the next amend names M
@@ -21,6 +21,7 @@ from cairn_fusion.recording.scan_bytes import move_scan
 from cairn_map.codec.cell_code import Profile
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.ids import CommitId, commit_id_from_text
+from cairn_map.commits.mark import Mark, check_place
 from cairn_map.errors import BadInputError, NotFoundError
 
 AnyCommit = Commit | CommitId | str
@@ -88,7 +89,15 @@ class Amending:
 
     def retract(self, measurement: AnyCommit, *, note: str) -> Commit:
         """Take one measurement back; as `Robot.retract`."""
-        commit = self._replica.retract(_commit_id(measurement), CommitFacts(note=note))
+        commit = self._replica.retract(commit_id_of(measurement), CommitFacts(note=note))
+        self._on_commit(commit)
+        return commit
+
+    def mark(self, mark: Mark, *, instead_of: AnyCommit | None) -> Commit:
+        """Commit a mark, perhaps in the place of an own one; as `Robot.mark`."""
+        check_place(mark, self._replica.geometry)
+        retracts = () if instead_of is None else (commit_id_of(instead_of),)
+        commit = self._replica.commit({}, CommitFacts(marks=(mark,), retracts=retracts))
         self._on_commit(commit)
         return commit
 
@@ -110,7 +119,7 @@ class Amending:
 
     def _scans_of(self, measurement: AnyCommit) -> CommitId:
         """Commit under which a measurement's scans are kept."""
-        commit = _commit_id(measurement)
+        commit = commit_id_of(measurement)
         found = self._replica.original_of(commit, self._kept.commits)
         if found is None:
             raise NotFoundError("no_scans", f"{commit} cannot be amended: {self._why_not(commit)}")
@@ -126,7 +135,8 @@ class Amending:
         return f"its scans are not kept: {self._kept.why_gone(commit)}"
 
 
-def _commit_id(commit: AnyCommit) -> CommitId:
+def commit_id_of(commit: AnyCommit) -> CommitId:
+    """Id of a commit."""
     if isinstance(commit, Commit):
         return commit.id
     return commit_id_from_text(commit) if isinstance(commit, str) else commit

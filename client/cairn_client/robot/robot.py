@@ -26,18 +26,18 @@ from cairn_calib.rig.rig import Rig
 from cairn_client.http.map_url import split_map_url
 from cairn_client.relay.carried_commits import Carrier, carrier_in
 from cairn_client.relay.link import RelayApi
-from cairn_client.replica.limits import STANDARD_LIMITS, Limits
+from cairn_client.replica.limits import Limits
 from cairn_client.replica.outbox import NO_NOTES, CommitFacts
 from cairn_client.replica.replica import Replica
-from cairn_client.replica.replica_state import ReplicaState
-from cairn_client.replica.replica_store import ReplicaStore
 from cairn_client.robot.alignment import STEP_M, STEP_RAD, align_points, points_of_scans
 from cairn_client.robot.alignment_verdict import Alignment
 from cairn_client.robot.amending import Amending, AnyCommit, facts_of_measurement
 from cairn_client.robot.kept_scans import KeptScans
+from cairn_client.robot.map_marks import seen_marks
 from cairn_client.robot.membership import Membership, bind_token, check_kinds
+from cairn_client.robot.replica_opening import open_replica
 from cairn_client.robot.robot_events import SIZE, Committed, Events, EventStream
-from cairn_client.robot.rounds import Rounds
+from cairn_client.robot.rounds import FLUSH_S, FOLDED_WITHIN_S, Rounds
 from cairn_client.robot.server_clock import ServerClock, Times
 from cairn_client.robot.status_report import OwnStatus
 from cairn_client.sync.link_profile import LINKS, LinkName
@@ -51,6 +51,7 @@ from cairn_fusion.recording.scan import Scan
 from cairn_map.codec.cell_code import Profile
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.ids import CommitId, robot_name
+from cairn_map.commits.mark import make_mark
 from cairn_map.epochs.history_map import HistoryMap
 from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import BadInputError, CairnError
@@ -59,14 +60,10 @@ from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.kernels.numba_runtime import show_compiling
 from cairn_map.machine_clocks import MACHINE_CLOCKS, MachineClocks
 from cairn_map.queries.map_snapshot import MapSnapshot
+from cairn_map.wire.mark_messages import MarkEntry
 from cairn_map.wire.messages import Mode
 
 log = logging.getLogger(__name__)
-
-FLUSH_S = 60.0
-"""Seconds that `close` may push before it leaves the rest for the next time."""
-FOLDED_WITHIN_S = 60.0
-"""Seconds that `sync(until_folded=True)` waits for the server's map."""
 
 
 class Robot:
@@ -142,7 +139,15 @@ class Robot:
         with ExitStack() as opened:  # what was opened is closed again if a later step fails
             opened.callback(self._api.close)
             self._kept_scans = KeptScans(Path(directory) / "scans", bytes_max=keep_scans_bytes)
-            self._replica = self._open_replica(Path(directory), geometry, limits)
+            self._replica, self._limits = open_replica(
+                Path(directory),
+                self._api,
+                robot=self.name,
+                map_name=self._map_name,
+                geometry=geometry,
+                limits=limits,
+                amendable=self._amendable_commits,
+            )
             opened.callback(self._replica.close)
             bind_token(self._replica.state, map_url)
             self._replica.state.note_use(url=map_url, mode=mode)
@@ -152,46 +157,6 @@ class Robot:
             self._rounds = self._make_rounds(token, scope, carrier)
             self._measurement = self._new_measurement()
             opened.pop_all()  # from here on `close` does it
-
-    def _open_replica(self, directory: Path, geometry: Geometry | MapLayer | None, limits: Limits | None) -> Replica:
-        """The directory's state; its grid is the given one, else the remembered one, else the server's."""
-        store = ReplicaStore(directory)
-        try:
-            state = ReplicaState(store)
-            self._limits = limits or state.limits or STANDARD_LIMITS
-            layer = geometry if isinstance(geometry, MapLayer) else state.layer
-            # A given grid alone is that of a map without epochs, unless the folder knows better.
-            if isinstance(geometry, Geometry):
-                layer = MapLayer(geometry=geometry, epoch_s=state.epoch_s)
-            # The one question that cannot wait for a link: without a grid no evidence has a place.
-            if layer is None:
-                info = self._api.map_info(self._map_name)
-                layer = info.layer
-                state.note_model(info.sensor_model)
-            replica = Replica(
-                store,
-                robot=self.name,
-                map_name=self._map_name,
-                geometry=layer.geometry,
-                epoch_s=layer.epoch_s,
-                amendable=self._amendable_commits,
-                memory_bytes_max=self._limits.map_bytes_max,
-                keep_acked_s=self._limits.keep_acked_s,
-            )
-            most = self._limits.map_bytes_max
-            log.info(
-                "robot %s: its map may take %s of memory",
-                self.name,
-                "all" if most is None else f"at most {most / 1e6:.0f} MB",
-            )
-            # Remembered only now that the folder has proven to be this robot's.
-            if limits is not None:
-                state.limits = limits
-            return replica
-        # The store holds the folder's lock: another try must get it.
-        except BaseException:
-            store.close()
-            raise
 
     def _amendable_commits(self) -> list[CommitId]:
         """Commits whose bytes stay for an amend; none if the disk is bounded, as they go first there."""
@@ -281,7 +246,7 @@ class Robot:
             ConflictError: kind `not_known`: the map has no epochs, so it holds nothing of earlier times.
         """
         self._check_open()
-        return self._replica.snapshot(model, at_s=at_s)
+        return self._replica.snapshot(model, at_s=at_s)  # made once for each state of the view
 
     def events(self, *, size: int = SIZE) -> EventStream:
         """Stream of the events from here on (`robot_events`), for one reader.
@@ -487,6 +452,41 @@ class Robot:
         """
         with self._lock:
             return self._amending().retract(measurement, note=note)
+
+    def mark(
+        self,
+        name: str,
+        at_m: Sequence[float],
+        *,
+        kind: str = "mark",
+        extent_m: Sequence[float] = (0.0, 0.0, 0.0),
+        note: str = "",
+        instead_of: AnyCommit | None = None,
+    ) -> Commit:
+        """Mark a place for all robots and people of the map; durable here, elsewhere as they sync.
+
+        Args:
+            name: one line of 1 to 64 characters.
+            at_m: its middle, x, y, z, metres, map frame.
+            kind: sort of thing, such as `hot_spot` or `door`.
+            extent_m: edges of a box around it, metres; zeros: a point.
+            note: up to 1024 characters.
+            instead_of: commit of an own mark that it takes the place of; `retract` takes one out.
+
+        Raises:
+            BadInputError: kind `bad_mark`, `bad_place`, or `not_own`: another's, which an operator changes.
+            UnreachableError: kind `store_failed`: the disk is full or broken.
+        """
+        time_s = self._clock.best_s()  # the server's, if it was learnt
+        mark = make_mark(kind=kind, name=name, at_m=at_m, extent_m=extent_m, note=note, time_s=time_s)
+        with self._lock:
+            return self._amending().mark(mark, instead_of=instead_of)  # durable, and pushed with the next round
+
+    def marks(self, box_m: Sequence[float] | None = None) -> list[MarkEntry]:
+        """Marks of the map at the last round, all or in a box (metres), and own ones; the first call takes a link."""
+        self._check_open()
+        self._rounds.begin_marks()  # each round follows them from here on
+        return seen_marks(self._replica, box_m)
 
     def sync(
         self,

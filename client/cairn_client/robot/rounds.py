@@ -19,6 +19,7 @@ from cairn_client.relay.carried_commits import Carrier
 from cairn_client.replica.limits import Limits
 from cairn_client.replica.replica import Replica
 from cairn_client.robot.cell_budget import NO_ROOM, CellBudget
+from cairn_client.robot.map_marks import follow_marks, keep_following
 from cairn_client.robot.membership import Membership
 from cairn_client.robot.robot_events import Events
 from cairn_client.robot.round_watch import RoundWatch
@@ -39,6 +40,10 @@ OnPush = Callable[[CommitId], None]
 
 FIRST_LOOK_S, LONGEST_LOOK_S = 0.05, 1.0
 """Pauses between rounds that look whether the server has folded; each is twice the one before."""
+FLUSH_S = 60.0
+"""Seconds that `Robot.close` may push before it leaves the rest for the next time."""
+FOLDED_WITHIN_S = 60.0
+"""Seconds that `Robot.sync(until_folded=True)` waits for the server's map."""
 RETRY_S = 30.0
 GONE_S = 3600.0
 """Time between two rounds once the map was deleted: only a person can bring it back, or let the robot in on another."""
@@ -181,6 +186,12 @@ class Rounds:
                 time.sleep(pause_s)
                 pause_s = min(2 * pause_s, LONGEST_LOOK_S)
 
+    def begin_marks(self) -> None:
+        """Fetch the map's marks if they never were: each round brings the copy on from then on."""
+        with self._lock:
+            if self._replica.marks.cursor is None:
+                self._membership.as_member(follow_marks, self._api, self._replica.marks, self._map_name)
+
     def start(self, *, every_s: float) -> None:
         """Do rounds in the background, if there are none yet."""
         if self._thread is None:
@@ -241,6 +252,7 @@ class Rounds:
         report.add_pushes(pushes)
         if self._mode != "viewer":
             report.waiting, report.pending = self._replica.behind()
+        keep_following(self._api, self._replica, self._map_name)
         # Then others' commits, and the status, which costs nothing if it is lost.
         if self._carrier is not None:
             self._carrier.exchange()

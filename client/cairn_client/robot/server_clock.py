@@ -101,6 +101,11 @@ class ServerClock:
         with self._lock:
             return None if self._known is None else self._known.offset_s + self._clocks.steady_s()
 
+    def best_s(self) -> float:
+        """The server's time now, or this machine's time of day where that is unknown."""
+        now_s = self.now_s()
+        return self._clocks.wall_s() if now_s is None else now_s
+
     def server_time(self, time_s: float) -> float | None:
         """The server's time of a scan that was stamped with this machine's time of day; None: unknown.
 

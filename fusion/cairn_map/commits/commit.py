@@ -3,7 +3,8 @@
     "CRCM" | version u8 | meta length u32 | meta (JSON) | cell count u32 | per cell: length u32, cell bytes
 
 In version 2, of maps with epochs, the meta names the layers and the epoch, and each cell begins with a u8, the number
-of its layer. A cell of a commit has one row, that of the epoch, and so is a cell file of version 1 in both.
+of its layer. A cell of a commit has one row, that of the epoch, and so is a cell file of version 1 in both. A commit
+of version 3 has marks in its meta, and no cells (`mark`).
 
 Its SHA-256 is taken over the meta bytes and the cells' canonical digests, so that cells may be recompressed without
 changing it. A retract is a commit without cells that names others; an amend is one with both. FORMAT.md is the norm.
@@ -12,7 +13,7 @@ changing it. A retract is a commit without cells that names others; an amend is 
 import hashlib
 import json
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Literal, Self
 
@@ -23,6 +24,7 @@ from pydantic import BaseModel, ConfigDict, FailFast, Field, ValidationError, mo
 from cairn_map.codec.cell_code import Profile, decode_cell, encode_cells
 from cairn_map.codec.octree.cell_head import decode_head
 from cairn_map.commits.ids import CommitId, commit_id_from_text
+from cairn_map.commits.mark import AMENDED_MAX, MARKS_MAX, Mark, MarkKey
 from cairn_map.epochs.epoch import BASE, EPOCH_MAX, Epoch
 from cairn_map.epochs.layer import Hex32, LayerIdentity, MapLayer
 from cairn_map.errors import BadInputError, DamagedDataError, first_error
@@ -30,13 +32,17 @@ from cairn_map.evidence.evidence import Evidence, every_sum_has_weight
 from cairn_map.evidence.grid import CellKey, Geometry
 
 MAGIC = b"CRCM"
-SUM_VERSION, EPOCH_VERSION = 1, 2
-"""Versions of a commit's bytes: of maps with one sum for all times, and of maps with epochs."""
+SUM_VERSION, EPOCH_VERSION, MARK_VERSION = 1, 2, 3
+"""Versions of a commit's bytes: of maps with one sum for all times, of maps with epochs, and with marks on any map."""
 EVICTION_FIELDS = frozenset({"keep_epochs", "weight_max"})
 """Fields of a layer that are reserved for maps that let old rows go."""
 LAYERS_MAX = 1
 """Layers of a commit that this reader knows; the format has room for 16."""
-CELL_PREFIX = {SUM_VERSION: struct.Struct("<I"), EPOCH_VERSION: struct.Struct("<BI")}
+CELL_PREFIX = {
+    SUM_VERSION: struct.Struct("<I"),
+    EPOCH_VERSION: struct.Struct("<BI"),
+    MARK_VERSION: struct.Struct("<I"),
+}
 HEAD = struct.Struct("<4sBI")
 META_BYTES_MAX = 1 << 20
 CELLS_MAX = 4096
@@ -80,7 +86,7 @@ class CommitMeta(BaseModel):
 
     id: Annotated[str, Field(max_length=96)]
     geometry: Hex32 | None = None
-    """Digest of the map's geometry; evidence for another grid is refused. None in version 2, which has `layers`."""
+    """Digest of the map's geometry; what is for another grid is refused. None in version 2, which has `layers`."""
     layers: Annotated[tuple[LayerIdentity, ...], Field(max_length=16), FailFast()] = ()
     """Layers of which it has cells; only in version 2."""
     epoch: Annotated[int, Field(ge=-EPOCH_MAX, le=EPOCH_MAX)] | None = None
@@ -100,6 +106,8 @@ class CommitMeta(BaseModel):
         tuple[Annotated[str, Field(max_length=96)], ...], Field(max_length=RETRACTS_MAX), FailFast()
     ] = ()
     note: Annotated[str, Field(max_length=1024)] = ""
+    marks: Annotated[tuple[Mark, ...], Field(max_length=MARKS_MAX), FailFast()] = ()
+    """Its marks, by number; only in version 3, of a commit without cells."""
     kind: Literal["commit"] = "commit"
 
     @model_validator(mode="after")
@@ -119,11 +127,15 @@ class CommitMeta(BaseModel):
             raise ValueError("a commit names either its geometry, or its layers and epoch")
         if len(self.layers) > LAYERS_MAX:
             raise ValueError(f"this reader knows commits of {LAYERS_MAX} layer, got {len(self.layers)}")
+        if self.marks and (self.layers or len(self.retracts) > AMENDED_MAX):
+            raise ValueError(f"a commit with marks names its geometry, and at most {AMENDED_MAX} commits to retract")
         return self
 
     @property
     def version(self) -> int:
         """Version of the commit's bytes."""
+        if self.marks:
+            return MARK_VERSION
         return EPOCH_VERSION if self.layers else SUM_VERSION
 
     @property
@@ -189,10 +201,12 @@ def make_commit(
     """
     layer = grid if isinstance(grid, MapLayer) else MapLayer(geometry=grid)
     geometry = layer.geometry
-    if meta.grid != geometry.digest().hex() or meta.layers != layer.identities:
+    if meta.grid != geometry.digest().hex() or meta.layers != (() if meta.marks else layer.identities):
         raise BadInputError("other_geometry", "the commit's meta names another geometry than its evidence has")
     # Only evidence that adds, and that has weights.
     held = {key: evidence for key, evidence in diff.items() if len(evidence)}
+    if meta.marks and held:
+        raise BadInputError("bad_commit", "a commit has either marks or evidence; make two of it")
     for evidence in held.values():
         if evidence.is_signed:
             raise negative_evidence()
@@ -314,7 +328,7 @@ def split_bytes(data: bytes) -> tuple[CommitMeta, bytes, list[bytes]]:
     _, version, meta_bytes = HEAD.unpack_from(data)
     prefix = CELL_PREFIX.get(version)
     if prefix is None:
-        raise BadInputError("unknown_version", f"this reader knows commits of version 1 and 2, got {version}")
+        raise BadInputError("unknown_version", f"this reader knows commits of version 1 to 3, got {version}")
     _check_size(len(data), 0, meta_bytes)
     # Meta.
     text = data[HEAD.size : HEAD.size + meta_bytes]
@@ -326,14 +340,21 @@ def split_bytes(data: bytes) -> tuple[CommitMeta, bytes, list[bytes]]:
         # Readers differ in which of two equal keys they take, and the SHA-256 is the same for all of them.
         _UNIQUE.decode(text.decode())
     except ValidationError as exc:
-        if any(set(error["loc"]) & EVICTION_FIELDS for error in exc.errors(include_url=False, include_input=False)):
+        errors = exc.errors(include_url=False, include_input=False)
+        if any(set(error["loc"]) & EVICTION_FIELDS for error in errors):
             raise BadInputError("unknown_version", "this reader knows no layers that let old rows go") from None
+        if any(error["loc"] == ("marks",) and error["type"] == "too_long" for error in errors):
+            raise BadInputError(
+                "too_many_marks", f"a commit has at most {MARKS_MAX} marks; make several of it"
+            ) from None
         raise DamagedDataError("bad_commit", f"commit meta: {first_error(exc)}") from None
     if meta.version != version:
         raise DamagedDataError("bad_commit", f"a commit of version {version} has the meta of version {meta.version}")
     # Cells: a length that is cut off counts as too large, so that `at` passes the end.
     (count,) = struct.unpack_from("<I", data, at - 4)
     _check_size(len(data), count, meta_bytes)
+    if meta.marks and count:
+        raise DamagedDataError("bad_commit", "a commit with marks has no cells")
     bodies: list[bytes] = []
     for _ in range(count):
         # Layer 0 is the only one, so a prefix of version 2 is one zero and the length.
@@ -375,7 +396,22 @@ def commit_sha(text: bytes, digests: list[bytes], *, version: int = SUM_VERSION)
 
 
 def version_of_meta(text: bytes) -> int:
-    """Version of a validated commit, by the bytes of its meta: one of version 2 names its layers."""
-    if b"layers" not in text and b"\\" not in text:  # nor is the name written in escapes
+    """Version of a validated commit, by the bytes of its meta: version 3 has marks, version 2 names its layers."""
+    if b"layers" not in text and b"marks" not in text and b"\\" not in text:  # nor is a name written in escapes
         return SUM_VERSION
-    return EPOCH_VERSION if "layers" in json.loads(text) else SUM_VERSION
+    fields = json.loads(text)
+    if fields.get("marks"):
+        return MARK_VERSION
+    return EPOCH_VERSION if fields.get("layers") else SUM_VERSION
+
+
+def living_marks(commits: Iterable[CommitMeta]) -> Mapping[MarkKey, Mark]:
+    """Marks of a set of commits less those that any of them takes out, by key; in any order the same."""
+    found: dict[MarkKey, Mark] = {}
+    out: set[CommitId] = set()
+    for meta in commits:
+        out.update(meta.retracted_ids)
+        commit = meta.commit_id if meta.marks else None
+        if commit is not None:
+            found |= {MarkKey(commit, number): mark for number, mark in enumerate(meta.marks)}
+    return dict(sorted((key, mark) for key, mark in found.items() if key.commit not in out))

@@ -2,7 +2,8 @@
 
     hello   the present state; the first event of every connection
     cells   changed cells             } the changes of one or more folds, in this order;
-    log     new log entries           } `cells` and `log` may be missing or come twice
+    marks   marks that came and went  } each but `head` may be missing or come twice
+    log     new log entries           }
     head    the newest cursor         } after a cut, `head` ends them
     robot   news of one robot
     beat    the link is alive
@@ -16,7 +17,8 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, FailFast, Field, TypeAdapter
 
-from cairn_map.wire.messages import Count, CursorText, LogEntry, NameText, RobotStatus
+from cairn_map.wire.mark_messages import MarkEntry
+from cairn_map.wire.messages import Count, CursorText, IdText, LogEntry, NameText, RobotStatus
 
 CELLS_MAX = 256
 """Cells in one event, at most; more are `many`."""
@@ -24,6 +26,8 @@ NAMES_MAX = 16_384
 """Most commits that the log entries of one event, or of one page of the log, name together, unless it is one entry."""
 ENTRIES_MAX = 100
 """Log entries in one event, at most: the newest."""
+MARKS_MAX = 64
+"""Marks in one event, at most; more are `many`."""
 CHAIN_DIGITS = 8
 EventId = Annotated[str, Field(pattern=r"^[!-~]{0,64}$")]
 """A text that a header may hold: the listener shows it again when it comes back."""
@@ -72,6 +76,17 @@ class CellsEvent(_Model):
     """i, j, k, lm."""
 
 
+class MarksEvent(_Model):
+    """Marks that came, and commits whose marks went."""
+
+    type: Literal["marks"] = "marks"
+    id: EventId
+    marks: Annotated[list[MarkEntry], Field(max_length=MARKS_MAX)] | Literal["many"]
+    """Those that came, oldest first; many: `GET .../main/marks` has them, and those that went."""
+    removed: Annotated[list[IdText], Field(max_length=MARKS_MAX), FailFast()] = []
+    """Commits whose marks were taken out."""
+
+
 class LogGrew(_Model):
     """New log entries, oldest first."""
 
@@ -106,7 +121,7 @@ class Beat(_Model):
     time_s: float
 
 
-LiveEvent = Hello | CellsEvent | LogGrew | HeadMoved | RobotHeard | Beat
+LiveEvent = Hello | CellsEvent | MarksEvent | LogGrew | HeadMoved | RobotHeard | Beat
 LIVE_EVENT: TypeAdapter[LiveEvent] = TypeAdapter(Annotated[LiveEvent, Field(discriminator="type")])
 
 

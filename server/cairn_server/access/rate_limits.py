@@ -95,7 +95,7 @@ class ActLimit:
             return
         wait_s = self._turns.take_turn(f"acts {token}", most=self._per_hour, per_s=self._per_hour / HOUR_S)
         if wait_s:
-            message = f"the token {token} may admit keys and retract {self._per_hour} times an hour"
+            message = f"the token {token} may admit keys, retract and mark {self._per_hour} times an hour"
             raise UnreachableError("quota", message, retry_after_s=math.ceil(wait_s))
 
 

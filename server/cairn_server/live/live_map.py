@@ -7,7 +7,7 @@ import threading
 import time
 from collections import OrderedDict, deque
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from cairn_map.commits.cursor import Cursor
 from cairn_map.evidence.grid import CellKey, cell_of_key
@@ -15,18 +15,21 @@ from cairn_map.wire.live_events import (
     CELLS_MAX,
     CHAIN_DIGITS,
     ENTRIES_MAX,
+    MARKS_MAX,
     NAMES_MAX,
     CellsEvent,
     EventPosition,
     HeadMoved,
     LiveEvent,
     LogGrew,
+    MarksEvent,
     RobotSign,
 )
+from cairn_map.wire.mark_messages import MarkEntry
 from cairn_map.wire.messages import LogEntry
 from cairn_server.store.history import is_proven
-from cairn_server.store.store import Store
-from cairn_server.store.store_rows import MapRow
+from cairn_server.store.store import Snapshot, Store
+from cairn_server.store.store_rows import MapRow, MarkChange, entries_of, removed_commits
 
 Signs = OrderedDict[str, tuple[int, RobotSign]]
 """By branch, with the tick at which it was heard, rising."""
@@ -56,6 +59,9 @@ class LiveChanges:
         """Log entry up to which changes may be missing here."""
         self._cells: OrderedDict[CellKey, int] = OrderedDict()
         self._entries: deque[LogEntry] = deque(maxlen=ENTRIES_MAX)
+        self._marks: list[MarkChange] = []
+        self._marks_floor = 0
+        """Log entry up to which changes of marks may be missing here."""
 
     @property
     def head(self) -> Cursor:
@@ -91,7 +97,12 @@ class LiveChanges:
             if start > known:  # no client listened for long
                 self._cells.clear()
                 self._entries.clear()
+                self._marks.clear()
                 self._floor = start
+                # A map without marks has none that may be missing.
+                oldest = snapshot.marks(after_seq=max(known, 0), limit=1)
+                if oldest and oldest[0].seq <= start:
+                    self._marks_floor = start
             for cell in sorted(snapshot.cells(after_seq=start), key=lambda cell: cell.lm):
                 self._cells[cell.key] = cell.lm
                 self._cells.move_to_end(cell.key)
@@ -101,9 +112,20 @@ class LiveChanges:
                 after = self._entries[-1].seq
                 while len(self._entries) > 1 and sum(len(entry.retracts) for entry in self._entries) > NAMES_MAX:
                     self._entries.popleft()
+            self._read_marks(snapshot, start)
             self._head = head
             while len(self._cells) > CELLS_KEPT:
                 self._floor = self._cells.popitem(last=False)[1]
+
+    def _read_marks(self, snapshot: Snapshot, start: int) -> None:
+        """Read the marks that changed after an entry; of very many only that there are."""
+        found = snapshot.marks(after_seq=start, limit=MARKS_MAX + 1)
+        self._marks += found
+        if len(self._marks) > MARKS_MAX:
+            # Marks of one entry are kept or dropped together: an event tells of whole entries.
+            is_all = len(found) <= MARKS_MAX
+            self._marks_floor = self._marks[-MARKS_MAX - 1].seq if is_all else snapshot.head.seq
+            self._marks = [change for change in self._marks if change.seq > self._marks_floor]
 
     def has_proof(self, seen: EventPosition) -> bool:
         """True if a listener's place is one of this log: not another server's, and not lost in a restore."""
@@ -118,6 +140,8 @@ class LiveChanges:
             if head is None or head.seq <= seen.seq or losses != self._losses:
                 return [], seen
             entries = [entry for entry in self._entries if entry.seq > seen.seq]
+            marks = [change for change in self._marks if change.seq > seen.seq]
+            has_all_marks = seen.seq >= self._marks_floor
             cells: list[tuple[int, int, int, int]] = []
             for key, lm in reversed(self._cells.items()):
                 if lm <= seen.seq or len(cells) > CELLS_MAX:
@@ -129,6 +153,10 @@ class LiveChanges:
         events: list[LiveEvent] = []
         if cells or is_many:  # a retract of what never came changes no cell
             events.append(CellsEvent(id=str(seen), cells="many" if is_many else cells))
+        if marks or not has_all_marks:
+            came: list[MarkEntry] | Literal["many"] = entries_of(marks) if has_all_marks else "many"
+            removed = list(map(str, removed_commits(marks))) if has_all_marks else []
+            events.append(MarksEvent(id=str(seen), marks=came, removed=removed))
         events.append(LogGrew(id=str(seen), entries=entries, left_out=head.seq - seen.seq - len(entries)))
         return [*events, HeadMoved(id=str(moved), cursor=str(head))], moved
 

@@ -22,7 +22,7 @@ from cairn_map.commits.ids import SERVERS_OWN
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.evidence import COUNT_MAX, SUM_MAX
 from cairn_map.evidence.grid import CellKey, Geometry, cell_of_key
-from cairn_server.store.store_rows import RobotShares, UsedPart
+from cairn_server.store.store_rows import NewCommit, RobotShares, UsedPart
 
 Tops = tuple[int, ...]
 """(2 + P) largest number of each plane. No array: a commit has few regions, and the thread that writes little time."""
@@ -35,6 +35,10 @@ ROBOTS_MAX = 256
 CARRIED_ROBOTS_MAX = 192
 """Number of such robots from which on a new one must come with a token of its own: who carries commits (a relay, the
 upstream server) can invent names, and would take the last places from robots that come themselves."""
+MARKS_OF_ROBOT_MAX = 16_384
+"""Most marks of one robot on a map that are not taken out: with the largest texts some 60 MB."""
+MARKS_OF_SERVERS_MAX = 65_536
+"""The same of all operators together."""
 INCARNATIONS_MAX = 16
 """Most incarnations of one robot that are not closed: disks lost or rolled back."""
 INTERVALS_OF_ROBOT_MAX = 24
@@ -174,3 +178,23 @@ def _plane_name(geometry: Geometry, plane: int) -> str:
         if plane - 2 < planes.stop:
             return f"{channel.name} {plane - 2 - planes.start}"
     return str(plane)
+
+
+def check_marks(commit: NewCommit, held: int) -> None:
+    """Refuse marks beyond those that a robot, or all operators, may have on a map.
+
+    Args:
+        commit: with marks.
+        held: marks of its robot that are not taken out.
+
+    Raises:
+        BadInputError: kind `too_many_marks`.
+    """
+    robot = commit.id.author.robot
+    most = MARKS_OF_SERVERS_MAX if robot in SERVERS_OWN else MARKS_OF_ROBOT_MAX
+    if held + len(commit.marks) > most:
+        raise BadInputError(
+            "too_many_marks",
+            f"{robot} has {held} marks on this map, of at most {most}: take old ones out (cairn map mark --remove), "
+            "and push this again",
+        )

@@ -38,6 +38,8 @@ from cairn_server.store.store_rows import (
     Fold,
     HeardRobot,
     MapRow,
+    MarkBox,
+    MarkChange,
     NamedCommit,
     NewCommit,
     Robot,
@@ -142,6 +144,13 @@ class Snapshot(Protocol):
 
     def chained(self, *, after_seq: int, limit: int) -> list[ChainedEntry]:
         """Log entries, oldest first, without what they say."""
+        ...
+
+    def marks(self, *, after_seq: int, limit: int, box: MarkBox | None = None) -> list[MarkChange]:
+        """Marks that changed after a log entry, by entry and number: whole entries, so `limit` of them or more.
+
+        With a box those whose own boxes overlap it. Fewer than `limit` are the last ones.
+        """
         ...
 
     def totals(self) -> Totals:
@@ -487,8 +496,8 @@ class Store(Protocol):
             ConflictError: kind `id_taken`: the id is kept with other bytes; or `evidence_gone`: it retracts a commit
                 whose evidence is not kept any more. Pushed again, with the same bytes, that is kept again.
             DeniedError: kind `not_admitted`: its author's name is bound to another key (`admission.check_commit`).
-            BadInputError: kind `evidence_overflow`: its robot's share of the sums is taken; or its number is refused
-                by `numbering.check_number`.
+            BadInputError: kind `evidence_overflow`: its robot's share of the sums is taken; `too_many_marks`; or its
+                number is refused by `numbering.check_number`.
         """
         ...
 

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.ids import Author, CommitId
+from cairn_map.commits.mark import Mark, MarkKey
 from cairn_map.commits.version_vector import VersionVector
 from cairn_map.epochs.epoch import BASE, Epoch
 from cairn_map.epochs.layer import MapLayer
@@ -14,6 +15,7 @@ from cairn_map.evidence.fingerprint import Fingerprint
 from cairn_map.evidence.grid import CellKey, Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.wire.access_messages import AuditEntry, RoleText
+from cairn_map.wire.mark_messages import MarkEntry
 from cairn_server.store.admission import OWN_WORD, Grounds
 
 AUDIT_ROWS_MAX = 100_000
@@ -70,6 +72,48 @@ class NewCommit:
     """Grounds on which it speaks for its author."""
     epoch: Epoch = BASE
     """Epoch of all its evidence."""
+    marks: tuple[Mark, ...] = ()
+    """Its marks, by number; then it has no evidence."""
+
+
+Millimetres = tuple[int, int, int]
+MarkBox = tuple[Millimetres, Millimetres]
+"""Lowest and highest corner, millimetres, both included."""
+
+
+class MarkChange(NamedTuple):
+    """Last change of one mark: it came, or was taken out. It never moves: an edit is another mark."""
+
+    seq: int
+    """Log entry that brought it, or took it out."""
+    key: MarkKey
+    record: str | None
+    """As `Mark.to_json`; None: it was taken out."""
+    amends: tuple[CommitId, ...] = ()
+    """Commits that its commit takes out."""
+
+
+def overlap(mark_low: Millimetres, mark_high: Millimetres, box: MarkBox) -> bool:
+    """True if a mark's own box has a point in another one."""
+    return all(low <= end and begin <= high for low, high, begin, end in zip(mark_low, mark_high, *box, strict=True))
+
+
+def entries_of(found: Iterable[MarkChange]) -> list[MarkEntry]:
+    """Marks that came, of changes that a store names."""
+    return [
+        MarkEntry(
+            key=str(change.key),
+            mark=Mark.model_validate_json(change.record),
+            amends=tuple(map(str, change.amends)),
+        )
+        for change in found
+        if change.record is not None
+    ]
+
+
+def removed_commits(found: Iterable[MarkChange]) -> list[CommitId]:
+    """Commits whose marks went, of changes that a store names; each once."""
+    return list(dict.fromkeys(change.key.commit for change in found if change.record is None))
 
 
 CAPTURED_AHEAD_MAX_S = 600.0

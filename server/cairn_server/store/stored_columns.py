@@ -4,12 +4,16 @@ import json
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
-from cairn_map.commits.ids import CommitId, commit_id_from_text
+from cairn_map.commits.ids import Author, CommitId, Incarnation, RobotName, commit_id_from_text
+from cairn_map.commits.mark import MarkKey
 from cairn_map.epochs.epoch import BASE, Epoch
 from cairn_map.evidence.fingerprint import fingerprint_from_bytes
 from cairn_map.evidence.grid import CellKey
 from cairn_map.wire.messages import LogEntry
-from cairn_server.store.store_rows import CellRow
+from cairn_server.store.store_rows import CellRow, MarkBox, MarkChange
+
+CORNERS = ("low_x", "low_y", "low_z", "high_x", "high_y", "high_z")
+"""Columns of the corners of a mark's own box."""
 
 
 class TableRows(NamedTuple):
@@ -89,3 +93,23 @@ def log_entry(
             "note": note or "",
         }
     )
+
+
+def corner_conditions(mark: str) -> str:
+    """SQL that is true of rows whose boxes overlap one, whose corners are its six values (of marks `?` or `%s`)."""
+    ends = [f"{low} <= {mark}" for low in CORNERS[:3]] + [f"{high} >= {mark}" for high in CORNERS[3:]]
+    return " AND ".join(ends)
+
+
+def corner_values(box: MarkBox) -> tuple[int, ...]:
+    """Values of `corner_conditions`."""
+    low, high = box
+    return (*high, *low)
+
+
+def mark_change(
+    seq: int, robot: str, incarnation: str, n: int, number: int, record: str | None, retracts: str
+) -> MarkChange:
+    """Change of a mark from its columns, and those of its commit."""
+    author = Author(RobotName(robot), Incarnation(incarnation))
+    return MarkChange(seq, MarkKey(CommitId(author, n), number), record, ids_from_text(retracts))

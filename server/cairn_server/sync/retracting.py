@@ -10,29 +10,29 @@ import hmac
 import math
 from collections.abc import Callable
 
-from cairn_map.commits.commit import RETRACTS_MAX, CommitMeta, make_commit, sha_without_evidence
-from cairn_map.commits.ids import OPERATOR, Author, CommitId, commit_id_from_text, new_incarnation
-from cairn_map.errors import BadInputError, ConflictError, NotFoundError
+from cairn_map.commits.commit import RETRACTS_MAX, sha_without_evidence
+from cairn_map.commits.ids import OPERATOR, CommitId, commit_id_from_text
+from cairn_map.errors import BadInputError, NotFoundError
 from cairn_map.wire.messages import Retract, Retracted
 from cairn_server.access.auth import Caller
 from cairn_server.store.numbering import EvidenceGoneError
 from cairn_server.store.store import Snapshot, Store
-from cairn_server.store.store_rows import MapRow, NewCommit, Selection
+from cairn_server.store.store_rows import MapRow, Selection
 from cairn_server.sync.held_commits import WantedCommits
+from cairn_server.sync.operator_commits import OperatorCommits
 
 
 class Retracts:
     """Retracts of this server's operators, on all maps of a store; called from many threads."""
 
-    def __init__(self, store: Store, wanted: WantedCommits, *, on_new: Callable[[], None]) -> None:
+    def __init__(
+        self, store: Store, commits: OperatorCommits, wanted: WantedCommits, *, on_new: Callable[[], None]
+    ) -> None:
         """`on_new` is called after each retract."""
         self._store = store
+        self.commits = commits
         self._wanted = wanted
         self._on_new = on_new
-        self.operator = new_incarnation()
-        """Incarnation of the author, new with every start: a restored server must not reuse the numbers it lost."""
-        self._next: dict[tuple[int, Author], int] = {}
-        """Next number, by map and author; a lower one says that the store was restored while this server ran."""
 
     def retract(self, row: MapRow, request: Retract, *, by: Caller) -> Retracted:
         """Undo commits exactly; durable on return.
@@ -52,7 +52,7 @@ class Retracts:
             return Retracted(id=None, commits=names)
         parts = [targets[start : start + RETRACTS_MAX] for start in range(0, len(targets), RETRACTS_MAX)]
         try:
-            ids = [str(self._append(row, part, request.note)) for part in parts]
+            ids = [str(self.commits.append(row, retracts=tuple(part), note=request.note)) for part in parts]
         except EvidenceGoneError as exc:
             self._wanted.note(row.name, exc.commits, asker=OPERATOR)
             raise
@@ -60,27 +60,6 @@ class Retracts:
         self._store.audit_log.add(by.name, "retract", detail, client=by.address)
         self._on_new()
         return Retracted(id=ids[-1], commits=names)
-
-    def _append(self, row: MapRow, targets: list[CommitId], note: str) -> CommitId:
-        """Keep the commit that names these targets, under a number that this server never used; durable on return."""
-        author = Author(OPERATOR, self.operator)
-        build = _builder(row, author, targets, note)
-
-        def build_next(n: int) -> NewCommit:
-            if n < self._next.get((row.number, author), 0):
-                raise _LostNumberError("id_taken", f"{CommitId(author, n)} was another retract, which was lost")
-            self._next[row.number, author] = n + 1
-            return build(n)
-
-        try:
-            return self._store.append_built(row, author, build_next).id
-        except _LostNumberError:
-            self.operator = new_incarnation()
-            return self._append(row, targets, note)
-
-
-class _LostNumberError(ConflictError):
-    """The next number of an author is one that this server has used."""
 
 
 def targets_of(request: Retract, snapshot: Snapshot) -> list[CommitId]:
@@ -97,7 +76,10 @@ def targets_of(request: Retract, snapshot: Snapshot) -> list[CommitId]:
         meant = "no commit of this map fits" if request.selects else "no commit is named"
         raise NotFoundError("nothing_to_retract", f"{meant}; `cairn map log` shows what there is")
     if any(target.author.robot == OPERATOR for target in targets):
-        raise BadInputError("not_retractable", "a retract is not retracted; push the evidence again")
+        raise BadInputError(
+            "not_retractable",
+            "a retract is not retracted: push the evidence again; a mark goes by cairn map mark --remove",
+        )
     return list(targets)
 
 
@@ -122,28 +104,3 @@ def _selection(request: Retract) -> Selection:
         pushed_s=interval(request.pushed_after_s, request.pushed_before_s),
         captured_s=interval(request.captured_after_s, request.captured_before_s),
     )
-
-
-def _builder(row: MapRow, author: Author, targets: list[CommitId], note: str) -> Callable[[int], NewCommit]:
-    def build(n: int) -> NewCommit:
-        names = tuple(map(str, targets))
-        meta = CommitMeta(
-            id=str(CommitId(author, n)),
-            geometry=None if row.layer.has_epochs else row.geometry.digest().hex(),
-            layers=row.layer.identities,
-            retracts=names,
-            note=note,
-        )
-        commit = make_commit(meta, {}, row.layer)
-        return NewCommit(
-            id=commit.id,
-            sha=commit.sha,
-            size_bytes=len(commit.data),
-            text=commit.text,
-            captured_s=None,
-            retracts=meta.retracted_ids,
-            diff={},
-            tops={},
-        )
-
-    return build

@@ -20,7 +20,7 @@ from tests.fixtures.client.world import stored_commits
 
 from cairn_client import main as cairn
 from cairn_client.cli.robots.run import _commit, _map_what_came, _Tally
-from cairn_client.folders.spool import Mark, Spool, remember
+from cairn_client.folders.spool import Spool, SpoolMark, remember
 from cairn_fusion.mapping.integrate import integrate_scan
 from cairn_fusion.recording.recording import open_recording
 from cairn_fusion.recording.recording_writer import RecordingWriter
@@ -188,7 +188,7 @@ def test_scans_that_nobody_grouped_are_grouped_and_go_on_where_a_mark_of_single_
         (stop,) = Spool(spool).stops(mole.replica)
         assert stop.scans == range(5)
         first_s = stop.source.files[0].time_s
-        remember(mole.replica, {"spool/a": Mark(first_s=first_s, stops=2, is_done=False).model_dump_json()})
+        remember(mole.replica, {"spool/a": SpoolMark(first_s=first_s, stops=2, is_done=False).model_dump_json()})
         (stop,) = Spool(spool).stops(mole.replica)
         assert stop.scans == range(2, 5)
         remember(mole.replica, stop.mark())

@@ -79,7 +79,7 @@ class AnyHistory(RuleBasedStateMachine):
         known = self.maps.get(name)
         if known is None:
             assert answer.status_code == 201
-            operator = None if other else Author(OPERATOR, self.live.service.sync.retracts.operator)
+            operator = None if other else Author(OPERATOR, self.live.service.sync.retracts.commits.operator)
             self.maps[name] = MapModel(operator)
             self.changed.add(name)
         elif other == (known.operator is None):
@@ -225,7 +225,8 @@ class AnyHistory(RuleBasedStateMachine):
         assert answer.status_code == 201, answer.text
         assert answer.json()["commits"] == [str(target) for target in targets]
         known = self.maps[name]
-        known.operator = Author(OPERATOR, self.live.service.sync.retracts.operator)  # another one after each start
+        # Another one after each start.
+        known.operator = Author(OPERATOR, self.live.service.sync.retracts.commits.operator)
         n = known.next_n(known.operator)
         assert answer.json()["id"] == str(CommitId(known.operator, n))
         named = [_Named(target) for target in targets]

@@ -18,6 +18,7 @@ from tests.fixtures.server.epoch_contract import EpochContract
 from tests.fixtures.server.evidence_contract import EvidenceContract
 from tests.fixtures.server.fetching import fetch
 from tests.fixtures.server.live import Live
+from tests.fixtures.server.mark_contract import MarkContract
 from tests.fixtures.server.pushes import MOLE, WREN, pushed, read, sum_of
 from tests.fixtures.server.replica_contract import ReplicaContract
 from tests.fixtures.server.shares_contract import SharesContract
@@ -51,6 +52,7 @@ class TestMemoryStore(
     CrowdContract,
     EvidenceContract,
     EpochContract,
+    MarkContract,
     BranchContract,
     AccessContract,
     AdmissionContract,

@@ -21,6 +21,7 @@ from tests.fixtures.server.crowd_contract import CrowdContract
 from tests.fixtures.server.deletion_contract import DeletionContract
 from tests.fixtures.server.epoch_contract import EpochContract
 from tests.fixtures.server.evidence_contract import EvidenceContract
+from tests.fixtures.server.mark_contract import MarkContract
 from tests.fixtures.server.pushes import MOLE, WREN, pushed
 from tests.fixtures.server.shares_contract import SharesContract, author_of
 from tests.fixtures.server.store_contract import NAMES, StoreContract, new_of
@@ -71,6 +72,7 @@ class TestSqliteStore(
     CrowdContract,
     EvidenceContract,
     EpochContract,
+    MarkContract,
     BranchContract,
     AccessContract,
     AdmissionContract,

@@ -319,7 +319,7 @@ def test_the_header_tells_what_a_robot_may_conclude(live: Live, monkeypatch: pyt
     assert header.vector[str(MOLE)] == [[0, 1]]
     assert header.tip == (1, commits[1].sha.hex())
     assert header.stable == {}
-    assert header.retracts == [f"operator.{live.service.sync.retracts.operator}.0"]
+    assert header.retracts == [f"operator.{live.service.sync.retracts.commits.operator}.0"]
     monkeypatch.setattr(live.service._fold_thread, "_fold_group", lambda *arguments: 0)
     live.push(row, pushed(2, 2))
     header = frames_of(ask_missing(live, row, NaiveAsker(MOLE).request()).content)[0]

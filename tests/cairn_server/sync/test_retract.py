@@ -124,7 +124,7 @@ def test_nothing_and_retracts_cannot_be_retracted(live: Live) -> None:
     row = live.new_map()
     assert kind_of(live.retract(row)) == "nothing_to_retract"
     assert kind_of(live.retract(row, robot="nobody")) == "nothing_to_retract"
-    target = f"operator.{live.service.sync.retracts.operator}.0"
+    target = f"operator.{live.service.sync.retracts.commits.operator}.0"
     answer = live.http.post(f"/maps/{row.name}/retracts", json={"commits": [target]})
     assert kind_of(answer) == "not_retractable"
 

@@ -9,6 +9,8 @@
     $ cairn map export http://127.0.0.1:8750/maps/lab --ply lab.ply --picture lab.png --cells lab/
     $ cairn map log http://127.0.0.1:8750/maps/lab --graph
     $ cairn map changes http://127.0.0.1:8750/maps/lab --since 14:05
+    $ cairn map marks http://127.0.0.1:8750/maps/lab
+    $ cairn map mark http://127.0.0.1:8750/maps/lab --add "north door" --at 1.5,-2,1 --kind door
     $ cairn map branches http://127.0.0.1:8750/maps/lab
     $ cairn map retract http://127.0.0.1:8750/maps/lab --robot mole --pushed-after 14:05 --dry-run
     $ cairn map robots list http://127.0.0.1:8750/maps/lab
@@ -28,6 +30,7 @@ import time
 from pathlib import Path
 
 from cairn_calib.rig.rig import load_rig
+from cairn_client.cli import marks
 from cairn_client.cli.arguments import (
     Subparsers,
     add_map_parser,
@@ -73,6 +76,8 @@ def main(argv: list[str]) -> int:
         changes.add_parser,
         map_export.add_get_parser,
         map_export.add_export_parser,
+        marks.add_list_parser,
+        marks.add_parser,
         query.add_parser,
         render.add_parser,
         _add_retract,

@@ -25,7 +25,17 @@ from cairn_client.cli.maps.branch_table import shown_metres
 from cairn_client.http.live_listener import Lost, listen
 from cairn_client.sync.responses import one_line, shown_text
 from cairn_map.commits.cursor import cursor_from_text
-from cairn_map.wire.live_events import CellsEvent, HeadMoved, Hello, LiveEvent, LogGrew, RobotHeard, RobotSign
+from cairn_map.wire.live_events import (
+    CellsEvent,
+    HeadMoved,
+    Hello,
+    LiveEvent,
+    LogGrew,
+    MarksEvent,
+    RobotHeard,
+    RobotSign,
+)
+from cairn_map.wire.mark_messages import MarkEntry
 
 
 def main(argv: list[str]) -> int:
@@ -68,12 +78,24 @@ def lines_of(event: LiveEvent | Lost) -> Iterator[str]:
                 yield f"{word}  {entry.id}  {entry.cells} cells, {shown_bytes(entry.size_bytes)}"
         case CellsEvent():
             yield f"{'many' if event.cells == 'many' else len(event.cells)} cells changed"
+        case MarksEvent(marks="many"):
+            yield "many marks changed; `cairn map marks` lists them"
+        case MarksEvent(marks=list(marks)):
+            yield from map(_mark_line, marks)
+            for commit in event.removed:
+                yield f"mark  {commit}  was changed or removed"
         case HeadMoved():
             yield f"head  {cursor_from_text(event.cursor).seq}"
         case RobotHeard():
             yield _robot_line(event.robot)
         case _:
             return
+
+
+def _mark_line(entry: MarkEntry) -> str:
+    x, y, z = entry.mark.place_m
+    place = f"({shown_metres(x)}, {shown_metres(y)}, {shown_metres(z)}) m"
+    return f"mark  {entry.key}  {entry.mark.kind}  {one_line(entry.mark.name)}  at {place}  by {one_line(entry.author)}"
 
 
 def _robot_line(sign: RobotSign) -> str:

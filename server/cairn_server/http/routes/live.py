@@ -233,5 +233,5 @@ def _host_of(origin: str) -> str | None:
 
 def _as_text(event: LiveEvent) -> str:
     """Text of one event; only the last event of a step moves the id that a browser returns after a cut."""
-    id_line = "" if isinstance(event, Beat) or event.type in ("cells", "log") else f"id: {event.id}\n"
+    id_line = "" if isinstance(event, Beat) or event.type in ("cells", "marks", "log") else f"id: {event.id}\n"
     return f"{id_line}event: {event.type}\ndata: {event.model_dump_json(exclude={'type'})}\n\n"

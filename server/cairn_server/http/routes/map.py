@@ -1,4 +1,4 @@
-"""Routes of maps and their log."""
+"""Routes of maps, their log and their marks."""
 
 from typing import Annotated
 
@@ -7,6 +7,7 @@ from fastapi import APIRouter, Depends, Query, Response
 from cairn_map.commits.commit import EPOCH_VERSION
 from cairn_map.errors import BadInputError
 from cairn_map.wire.live_events import NAMES_MAX
+from cairn_map.wire.mark_messages import PAGE_MAX, MarkPage, MarkReceipt, MarkRequest
 from cairn_map.wire.messages import CreateMap, LogEntry, MapDeleted, MapInfo, MapSizes, Retract, Retracted
 from cairn_server.access.auth import READING, Caller, Role
 from cairn_server.http.routes.callers import READERS, Format, Map, Operations, Times, admin, allowed, reader_somewhere
@@ -120,3 +121,38 @@ def log(
     """Log entries, oldest first."""
     with service.store.snapshot(row) as snapshot:
         return [times(entry) for entry in snapshot.log(after_seq=after, limit=limit, names_max=NAMES_MAX)]
+
+
+@router.get("/maps/{name}/main/marks", dependencies=READERS)
+def list_marks(
+    service: Operations,
+    row: Map,
+    box: Annotated[
+        str | None, Query(max_length=200, description="x0,y0,z0,x1,y1,z1: marks in this box, metres, map frame")
+    ] = None,
+    after: Annotated[
+        str | None, Query(max_length=128, description="`cursor` of the page before: only what is new")
+    ] = None,
+    limit: Annotated[int, Query(ge=1, le=PAGE_MAX, description="marks in a page, which ends with a commit")] = PAGE_MAX,
+) -> MarkPage:
+    """Marks of the map, or of a box: all, or those that came and went after a page that the client has."""
+    return service.sync.marking.page(row, after=after, limit=limit, box=box)
+
+
+@router.post(
+    "/maps/{name}/main/marks",
+    status_code=201,
+    openapi_extra=json_body(
+        MarkRequest,
+        example={"mark": {"kind": "door", "name": "north door", "place_m": [1.5, -2.0, 1.0], "note": "locked"}},
+    ),
+)
+def put_mark(
+    service: Operations,
+    row: Map,
+    caller: Annotated[Caller, Depends(allowed(Role.OPERATOR))],
+    body: Annotated[MarkRequest, json_of(MarkRequest)],
+) -> MarkReceipt:
+    """Add a mark as an operator, or change or remove anybody's; robots push commits with their own."""
+    service.acts.take(caller.name, is_admin=caller.role is Role.ADMIN)
+    return service.sync.marking.put(row, body, by=caller)

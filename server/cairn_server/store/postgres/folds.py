@@ -16,7 +16,7 @@ from cairn_map.commits.ids import Author, CommitId
 from cairn_server.store.history import KnownVectors, crosses_mark
 from cairn_server.store.objects.cold_bytes import NoObjects
 from cairn_server.store.postgres.connections import Connection, Connections, first, rows
-from cairn_server.store.postgres.shares import give_back_sums, lock_head
+from cairn_server.store.postgres.shares import COUNT_MARKS, give_back_sums, lock_head
 from cairn_server.store.postgres.snapshot import PgSnapshot
 from cairn_server.store.postgres.tile_rows import (
     COUNTED,
@@ -68,13 +68,22 @@ WITH e AS (SELECT * FROM unnest(%(seqs)s::bigint[], %(kinds)s::bytea[], %(number
 ), folded AS (
     UPDATE commits SET folded_seq = e.seq, folded_age_s = %(age_s)s::float8
     FROM e WHERE map = %(map)s AND commits.number = e.number AND e.kind = %(fold)s AND folded_seq IS NULL
+), marked AS (
+    UPDATE mark SET changed_seq = e.seq
+    FROM e WHERE mark.map = %(map)s AND commit_number = e.number AND e.kind = %(fold)s AND changed_seq IS NULL
 )
 INSERT INTO touched (map, layer, cell, seq, kind, robot, incarnation, n, size_bytes, epoch)
 SELECT d.map, d.layer, d.cell, e.seq, e.kind, c.robot, c.incarnation, c.n, coalesce(octet_length(d.body), d.size_bytes),
     c.epoch
 FROM e JOIN commits AS c ON c.map = %(map)s AND c.number = e.number
     JOIN diff AS d ON d.map = c.map AND d.commit_number = c.number"""
-"""SQL that writes a fold's log entries, what they touch, and which commits are folded by them."""
+"""SQL that writes a fold's log entries, what they touch, and which commits and marks come with them."""
+TAKE_MARKS_OUT = """
+    UPDATE mark SET changed_seq = e.seq, record = NULL
+    FROM unnest(%(seqs)s::bigint[], %(kinds)s::bytea[], %(numbers)s::bigint[]) AS e (seq, kind, number)
+    WHERE mark.map = %(map)s AND mark.commit_number = e.number AND e.kind <> %(fold)s AND record IS NOT NULL
+    RETURNING mark.commit_number"""
+"""SQL that notes the log entries which took marks out, whose records go (values of `ENTER`)."""
 
 CLAIM = """
 WITH wanted AS (SELECT * FROM unnest(%(maps)s::bigint[]) WITH ORDINALITY AS w (map, turn)),
@@ -201,6 +210,14 @@ def _write_entries(connection: Connection, row: MapRow, fold: Fold, age_s: float
             values,
         )
         give_back_sums(connection, row, out)
+        _take_marks_out(connection, values)
+
+
+def _take_marks_out(connection: Connection, values: dict[str, object]) -> None:
+    """Note the log entries that took marks out, and count them off; the values are those of `ENTER`."""
+    gone = [number for (number,) in rows(connection, TAKE_MARKS_OUT, values)]
+    for number in sorted(set(gone)):
+        connection.execute(COUNT_MARKS, {"map": values["map"], "number": number, "more": -gone.count(number)})
 
 
 def _write_progress(connection: Connection, row: MapRow, fold: Fold) -> None:

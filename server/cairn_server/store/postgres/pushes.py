@@ -15,10 +15,11 @@ from cairn_map.errors import ConflictError, UnreachableError
 from cairn_server.store.postgres.connections import Connection, Connections, first
 from cairn_server.store.postgres.retention import check_kept, count_kept, is_retracted, remember_evidence
 from cairn_server.store.postgres.robot_keys import admit_commit
-from cairn_server.store.postgres.schema import NOW_S
-from cairn_server.store.postgres.shares import CHARGE, charge_of, check_charge, lock_head, note_number
+from cairn_server.store.postgres.schema import MARKS_OLDEST, NOW_S, bar_older_programs
+from cairn_server.store.postgres.shares import CHARGE, COUNT_MARKS, charge_of, check_charge, lock_head, note_number
+from cairn_server.store.shares import check_marks
 from cairn_server.store.store_rows import MapRow, NewCommit
-from cairn_server.store.stored_columns import epoch_to_column
+from cairn_server.store.stored_columns import CORNERS, epoch_to_column
 
 KEEP = f"""
     INSERT INTO commits (
@@ -51,13 +52,20 @@ WITH next AS (
 SELECT number FROM kept"""
 SLOW_CHARGE = CHARGE.format(source="")
 SLOW_KEEP = KEEP.format(source="")
+INSERT_MARKS = (
+    f"INSERT INTO mark (map, commit_number, n, {', '.join(CORNERS)}, record)"
+    " SELECT %(map)s, %(number)s, u.* FROM unnest(%(n)s::bigint[], "
+    + ", ".join(f"%({corner})s::bigint[]" for corner in CORNERS)
+    + ", %(record)s::text[]) AS u"
+)
 
 
 def append_commit(connections: Connections, row: MapRow, commit: NewCommit, *, age_s: float) -> bool:
     """Keep a commit at an age of the store; False if the same one is kept already. Durable on return."""
     values = _values(row, commit, age_s)
-    # A server's own commits share an account, and retracts must not miss what is dropped: both take the lock.
-    if not commit.retracts and _append_fast(connections, values):
+    # A server's own commits share an account, retracts must not miss what is dropped, and marks are counted: under the
+    # lock.
+    if not commit.retracts and not commit.marks and _append_fast(connections, values):
         return True
     return connections.run(lambda connection: append_slowly(connection, row, commit, age_s=age_s))
 
@@ -88,7 +96,11 @@ def append_slowly(connection: Connection, row: MapRow, commit: NewCommit, *, age
     if commit.tops:
         check_charge(connection, row, commit.id, commit.tops)
         connection.execute(SLOW_CHARGE, values)
-    _insert_diff(connection, row, first(connection, SLOW_KEEP, values), commit)
+    number = first(connection, SLOW_KEEP, values)
+    _insert_diff(connection, row, number, commit)
+    if commit.marks:
+        bar_older_programs(connection, MARKS_OLDEST, what="marks", instead="push no marks")
+        _insert_marks(connection, row, number, commit)
     return True
 
 
@@ -160,3 +172,23 @@ def _insert_diff(connection: Connection, row: MapRow, number: int, commit: NewCo
         " FROM unnest(%(keys)s::bigint[], %(bodies)s::bytea[]) AS d (cell, body)",
         {"map": row.number, "number": number, **_bodies(commit)},
     )
+
+
+def _insert_marks(connection: Connection, row: MapRow, number: int, commit: NewCommit) -> None:
+    """Keep the marks of a commit that is new and has some.
+
+    Raises:
+        BadInputError: kind `too_many_marks`.
+    """
+    query = "SELECT coalesce(sum(marks), 0)::bigint FROM author WHERE map = %s AND robot = %s"
+    check_marks(commit, first(connection, query, (row.number, commit.id.author.robot)))
+    corners = zip(*((*mark.low_mm, *mark.high_mm) for mark in commit.marks), strict=True)
+    values = {
+        "map": row.number,
+        "number": number,
+        "n": list(range(len(commit.marks))),
+        "record": [mark.to_json() for mark in commit.marks],
+        **{name: list(column) for name, column in zip(CORNERS, corners, strict=True)},
+    }
+    connection.execute(INSERT_MARKS.encode(), values)
+    connection.execute(COUNT_MARKS, {"map": row.number, "number": number, "more": len(commit.marks)})

@@ -147,6 +147,7 @@ LATER = {
     "log": "seq",
     "commits": "robot, incarnation, n",
     "tile": "layer, tile",
+    "mark": "commit_number, n",
     "held": "account, region",
     "retracted": "id",
     "vector_mark": "seq",

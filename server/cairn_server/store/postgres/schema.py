@@ -21,9 +21,10 @@ from psycopg import errors
 from psycopg.conninfo import conninfo_to_dict
 
 from cairn_map.commits.ids import SERVERS_OWN
-from cairn_map.errors import BadInputError, CairnError
+from cairn_map.errors import BadInputError, CairnError, ConflictError
 from cairn_server.store.postgres.connections import PRIMARY, Connection, connect, connect_to_any, first
 from cairn_server.store.postgres.failures import opening_failure
+from cairn_server.store.replica_notes import SERVER_S
 
 SERVER_MIN = 150_000
 """Oldest PostgreSQL, as its `server_version_num`."""
@@ -384,6 +385,26 @@ UPDATE author SET kept_bytes = kept.size_bytes FROM (
 ) AS kept
 WHERE author.map = kept.map AND author.robot = kept.robot AND author.incarnation = kept.incarnation;
 """
+MARKS = """
+CREATE TABLE mark (
+    map bigint,
+    commit_number bigint,
+    n bigint,                                       -- its number in the commit
+    changed_seq bigint,                             -- log entry that brought it, or took it out; NULL: pending
+    low_x bigint NOT NULL,                          -- corners of its box, millimetres
+    low_y bigint NOT NULL,
+    low_z bigint NOT NULL,
+    high_x bigint NOT NULL,
+    high_y bigint NOT NULL,
+    high_z bigint NOT NULL,
+    record text,                                    -- as the commit has it, JSON; NULL: it was taken out
+    PRIMARY KEY (map, commit_number, n)
+);
+CREATE INDEX mark_changed ON mark (map, changed_seq, low_x, low_y, low_z, high_x, high_y, high_z);
+ALTER TABLE author ADD COLUMN marks bigint NOT NULL DEFAULT 0;          -- of its commits, that are not taken out
+"""
+MARKS_OLDEST = 10
+"""Oldest step whose programs work on a store with marks: others take a commit with marks for a damaged one."""
 BOUND_OLDEST = 4
 """Oldest step whose programs read a store of which bytes are in an object store."""
 
@@ -398,7 +419,8 @@ class Step:
 
 
 STEPS = tuple(
-    Step(sql, oldest=1) for sql in (FIRST, REPLICAS, SERVERS, OBJECTS, OWNED_OBJECTS, EPOCHS, CLOCK, ADDRESSES, GONE)
+    Step(sql, oldest=1)
+    for sql in (FIRST, REPLICAS, SERVERS, OBJECTS, OWNED_OBJECTS, EPOCHS, CLOCK, ADDRESSES, GONE, MARKS)
 )
 
 
@@ -512,3 +534,33 @@ def _take_steps(connection: Connection) -> None:
     connection.execute("DELETE FROM cairn_schema")
     newest = max(oldest, *(step.oldest for step in STEPS))
     connection.execute("INSERT INTO cairn_schema VALUES (%s, %s)", (len(STEPS), newest))
+
+
+def bar_older_programs(connection: Connection, oldest: int, *, what: str, instead: str) -> None:
+    """Keep programs that know no step `oldest` from this store, whose rows they would take for damage.
+
+    Those that start are refused by their schema; those that run are counted.
+
+    Args:
+        connection: inside the transaction that brings what they do not know.
+        oldest: oldest step whose programs know it.
+        what: name of it, for people.
+        instead: what can be done without it.
+
+    Raises:
+        ConflictError: kind `older_servers`: some of them work on the store.
+    """
+    if (first(connection, "SELECT oldest FROM cairn_schema") or 0) >= oldest:
+        return
+    query = (
+        "SELECT count(*) FROM server WHERE coalesce(step, 0) < %s"
+        " AND heard_at > clock_timestamp() - make_interval(secs => %s::float8)"
+    )
+    count = first(connection, query, (oldest, SERVER_S))
+    if count:
+        raise ConflictError(
+            "older_servers",
+            f"servers of an earlier version ({count}) work on this store and know no {what}: update them first, or "
+            f"{instead}",
+        )
+    connection.execute("UPDATE cairn_schema SET oldest = %s WHERE oldest < %s", (oldest, oldest))

@@ -52,6 +52,11 @@ CHARGE = """
         FROM unnest(held.tops, excluded.tops, %(limits)s::bigint[]) WITH ORDINALITY AS p (had, top, most, plane)
     )"""
 """SQL that adds a commit's largest numbers to its account, region by region in rising order."""
+COUNT_MARKS = """
+    UPDATE author SET marks = marks + %(more)s FROM commits AS c
+    WHERE c.map = %(map)s AND c.number = %(number)s
+        AND author.map = c.map AND author.robot = c.robot AND author.incarnation = c.incarnation"""
+"""SQL that counts the marks of a commit's author that are not taken out."""
 
 
 def charge_of(commit: CommitId, tops: Mapping[int, Tops], planes: int) -> dict[str, Any]:

@@ -30,11 +30,20 @@ from cairn_server.store.store_rows import (
     CellRow,
     ChainedEntry,
     Contribution,
+    MarkBox,
+    MarkChange,
     NamedCommit,
     Selection,
     Totals,
 )
-from cairn_server.store.stored_columns import cell_row, epoch_from_column, log_entry
+from cairn_server.store.stored_columns import (
+    cell_row,
+    corner_conditions,
+    corner_values,
+    epoch_from_column,
+    log_entry,
+    mark_change,
+)
 from cairn_server.store.tiles import Box, is_in_box
 
 OF_COMMIT = "map = %s AND robot = %s AND incarnation = %s AND n = %s"
@@ -326,6 +335,10 @@ class PgSnapshot:
             for seq, kind, robot, incarnation, n, sha, chain in found
         ]
 
+    def marks(self, *, after_seq: int, limit: int, box: MarkBox | None = None) -> list[MarkChange]:
+        """Marks that changed after a log entry, in a box, oldest first: whole entries, with `limit` marks or more."""
+        return _changed_marks(self._connection, self._map, after_seq=after_seq, limit=limit, box=box)
+
     def totals(self) -> Totals:
         """Sizes."""
         sums, corners = totals_of(self._connection, self._map)
@@ -356,3 +369,26 @@ def _said(meta: bytes) -> tuple[str | None, str | None, str | None, str | None]:
         return said.get("parent"), said.get("seen"), place, said.get("note")
     except (ValueError, TypeError, AttributeError, LookupError):
         return None, None, None, None
+
+
+def _changed_marks(
+    connection: Connection, map_number: int, *, after_seq: int, limit: int, box: MarkBox | None
+) -> list[MarkChange]:
+    """Marks changed after a log entry, in a box, by entry and number; as `Snapshot.marks`."""
+    where: str = "map = %s AND changed_seq > %s"
+    values: tuple[int, ...] = (map_number, after_seq)
+    if box is not None:
+        where, values = f"{where} AND {corner_conditions('%s')}", (*values, *corner_values(box))
+    # A page ends with an entry, that of its last row, which is found along the index alone: it has the corners, too.
+    query = f"SELECT changed_seq FROM mark WHERE {where} ORDER BY changed_seq LIMIT 1 OFFSET %s"
+    last = first(connection, query, (*values, limit - 1))
+    if last is not None:
+        where, values = f"{where} AND changed_seq <= %s", (*values, last)
+    found = rows(
+        connection,
+        "SELECT changed_seq, robot, incarnation, c.n, m.n, record, retracts FROM"
+        f" (SELECT * FROM mark WHERE {where}) AS m JOIN commits AS c ON c.map = m.map AND c.number = commit_number"
+        " ORDER BY changed_seq, m.n",
+        values,
+    )
+    return [mark_change(*row) for row in found]

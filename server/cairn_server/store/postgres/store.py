@@ -12,7 +12,7 @@ from cairn_map.commits.cursor import Cursor, first_chain
 from cairn_map.commits.ids import Author
 from cairn_map.epochs.epoch import BASE, Epoch
 from cairn_map.epochs.layer import MapLayer
-from cairn_map.errors import ConflictError, UnreachableError
+from cairn_map.errors import UnreachableError
 from cairn_map.evidence.fingerprint import ZERO
 from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
@@ -29,11 +29,10 @@ from cairn_server.store.postgres.reads import PgReads
 from cairn_server.store.postgres.replica_notes import PgReplicaNotes
 from cairn_server.store.postgres.retention import DYING, clear_part, delete_map, forget_evidence
 from cairn_server.store.postgres.robot_keys import PgAdmittedKeys
-from cairn_server.store.postgres.schema import EPOCHS_OLDEST, NOW_S, prepare
+from cairn_server.store.postgres.schema import EPOCHS_OLDEST, NOW_S, bar_older_programs, prepare
 from cairn_server.store.postgres.shares import PgShares
 from cairn_server.store.postgres.tokens import PgAuditLog, PgTokens
 from cairn_server.store.postgres.writing_threads import WritingThreads
-from cairn_server.store.replica_notes import SERVER_S
 from cairn_server.store.store_age import CLOCKS, AgeMark, Clocks, StoreAge
 from cairn_server.store.store_clock import ClockMark, clock_mark_from_text
 from cairn_server.store.store_rows import Branch, Fold, MapRow, NewCommit
@@ -158,7 +157,9 @@ class PgStore(PgReads):
             if not made.rowcount:
                 return False
             if layer.has_epochs:
-                bar_older_programs(connection)
+                bar_older_programs(
+                    connection, EPOCHS_OLDEST, what="maps with epochs", instead="make a map without epochs"
+                )
             connection.execute(
                 "INSERT INTO head (map, log_id, seq, chain, fingerprint) VALUES (%s, %s, 0, %s, %s)",
                 (number, log_id, first_chain(log_id, layer.digest()), ZERO.to_bytes()),
@@ -278,25 +279,3 @@ class PgStore(PgReads):
         self._threads.close()
         self._noting.close()
         self._connections.close()
-
-
-def bar_older_programs(connection: Connection) -> None:
-    """Keep programs that know nothing of epochs from a store that gets its first map with them.
-
-    They would take its cells for damaged. Those that start are refused by their schema; those that run are counted.
-
-    Raises:
-        ConflictError: kind `older_servers`.
-    """
-    older = (
-        "SELECT count(*) FROM server WHERE coalesce(step, 0) < %s"
-        " AND heard_at > clock_timestamp() - make_interval(secs => %s::float8)"
-    )
-    count = first(connection, older, (EPOCHS_OLDEST, SERVER_S))
-    if count:
-        raise ConflictError(
-            "older_servers",
-            f"servers of an earlier version ({count}) work on this store and know no maps with epochs: update them "
-            "first, or make a map without epochs",
-        )
-    connection.execute("UPDATE cairn_schema SET oldest = %s WHERE oldest < %s", (EPOCHS_OLDEST, EPOCHS_OLDEST))

@@ -7,6 +7,7 @@ import apsw
 from cairn_map.commits.cursor import ENTRY_FOLD
 from cairn_map.errors import ConflictError
 from cairn_server.store.history import KnownVectors, crosses_mark
+from cairn_server.store.shares import check_marks
 from cairn_server.store.sqlite.retention import check_kept, check_lives, count_kept, is_retracted, remember_evidence
 from cairn_server.store.sqlite.robot_keys import admit_commit
 from cairn_server.store.sqlite.schema import MAPS
@@ -15,8 +16,10 @@ from cairn_server.store.sqlite.snapshot import SqliteSnapshot
 from cairn_server.store.sqlite.tile_rows import TileWriter, mark_at, recount_tile
 from cairn_server.store.sqlite.writer import first
 from cairn_server.store.store_rows import CellRow, Fold, MapRow, NewCommit
-from cairn_server.store.stored_columns import epoch_to_column
+from cairn_server.store.stored_columns import CORNERS, epoch_to_column
 from cairn_server.store.tiles import tile_of
+
+INSERT_MARK = f"INSERT INTO mark (map, commit_number, n, {', '.join(CORNERS)}, record) VALUES ({', '.join('?' * 10)})"  # noqa: S608 - our own columns
 
 
 def append_commit(connection: apsw.Connection, row: MapRow, commit: NewCommit, *, age_s: float) -> bool:
@@ -62,7 +65,9 @@ def append_commit(connection: apsw.Connection, row: MapRow, commit: NewCommit, *
             epoch_to_column(commit.epoch),
         ),
     )
-    _insert_diff(connection, connection.last_insert_rowid(), commit)
+    number = connection.last_insert_rowid()
+    _insert_diff(connection, number, commit)
+    _insert_marks(connection, row, number, commit)
     return True
 
 
@@ -99,8 +104,11 @@ def write_fold(connection: apsw.Connection, row: MapRow, fold: Fold, *, age_s: f
             else "UPDATE commits SET unfolded_seq = ? WHERE number = ?",
             (seq, age_s, entry.commit) if entry.kind == ENTRY_FOLD else (seq, entry.commit),
         )
-        if entry.kind != ENTRY_FOLD:
+        if entry.kind == ENTRY_FOLD:
+            _bring_marks(connection, row, entry.commit, seq)
+        else:
             give_back_sums(connection, row, entry.commit)
+            _take_marks_out(connection, row, entry.commit, seq)
     connection.executemany(
         "INSERT INTO retracted (map, id) VALUES (?, ?)", [(row.number, str(target)) for target in fold.retracted]
     )
@@ -164,3 +172,42 @@ def _insert_diff(connection: apsw.Connection, number: int, commit: NewCommit) ->
         "INSERT INTO diff (commit_number, cell, body) VALUES (?, ?, ?)",
         [(number, cell, body) for cell, body in commit.diff.items()],
     )
+
+
+def _insert_marks(connection: apsw.Connection, row: MapRow, number: int, commit: NewCommit) -> None:
+    """Keep the marks of a commit that is new, if it has any.
+
+    Raises:
+        BadInputError: kind `too_many_marks`.
+    """
+    if not commit.marks:
+        return
+    author = commit.id.author
+    query = "SELECT coalesce(sum(marks), 0) FROM author WHERE map = ? AND robot = ?"
+    check_marks(commit, first(connection, query, (row.number, author.robot)))
+    connection.executemany(
+        INSERT_MARK,
+        [(row.number, number, n, *mark.low_mm, *mark.high_mm, mark.to_json()) for n, mark in enumerate(commit.marks)],
+    )
+    _count_marks(connection, row, number, len(commit.marks))
+
+
+def _bring_marks(connection: apsw.Connection, row: MapRow, number: int, seq: int) -> None:
+    """Note the log entry that brought the marks of a commit."""
+    query = "UPDATE mark SET changed_seq = ? WHERE map = ? AND commit_number = ? AND changed_seq IS NULL"
+    connection.execute(query, (seq, row.number, number))
+
+
+def _take_marks_out(connection: apsw.Connection, row: MapRow, number: int, seq: int) -> None:
+    """Note the log entry that took the marks of a commit out, whose records go."""
+    query = "UPDATE mark SET changed_seq = ?, record = NULL WHERE map = ? AND commit_number = ? AND record IS NOT NULL"
+    connection.execute(query, (seq, row.number, number))
+    if connection.changes():
+        _count_marks(connection, row, number, -connection.changes())
+
+
+def _count_marks(connection: apsw.Connection, row: MapRow, number: int, more: int) -> None:
+    """Count the marks of a commit's author that are not taken out."""
+    author = "(SELECT robot, incarnation FROM commits WHERE number = ?)"
+    query = f"UPDATE author SET marks = marks + ? WHERE map = ? AND (robot, incarnation) = {author}"  # noqa: S608 - our own clause
+    connection.execute(query, (more, row.number, number))

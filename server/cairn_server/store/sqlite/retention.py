@@ -119,6 +119,7 @@ SMALL = {
     "touched": "cell, seq",
     "log": "seq",
     "tile": "tile",
+    "mark": "commit_number, n",
     "held": "account, region",
     "author": "robot, incarnation",
     "retracted": "id",

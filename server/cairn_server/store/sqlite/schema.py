@@ -347,6 +347,25 @@ UPDATE author SET kept_bytes = coalesce((
 ), 0);
 """
 
+MARKS = """
+CREATE TABLE mark (
+    map INTEGER NOT NULL REFERENCES map,
+    commit_number INTEGER NOT NULL,
+    n INTEGER NOT NULL,             -- its number in the commit
+    changed_seq INTEGER,            -- log entry that brought it, or took it out; NULL: pending
+    low_x INTEGER NOT NULL,         -- corners of its box, millimetres
+    low_y INTEGER NOT NULL,
+    low_z INTEGER NOT NULL,
+    high_x INTEGER NOT NULL,
+    high_y INTEGER NOT NULL,
+    high_z INTEGER NOT NULL,
+    record TEXT,                    -- as the commit has it, JSON; NULL: it was taken out
+    PRIMARY KEY (map, commit_number, n)
+) WITHOUT ROWID;
+CREATE INDEX mark_changed ON mark (map, changed_seq, low_x, low_y, low_z, high_x, high_y, high_z);
+ALTER TABLE author ADD COLUMN marks INTEGER NOT NULL DEFAULT 0;     -- of its commits, that are not taken out
+"""
+
 STEPS = (
     FIRST,
     STAMPS,
@@ -367,6 +386,7 @@ STEPS = (
     CLOCK,
     ADDRESSES,
     GONE,
+    MARKS,
 )
 
 

@@ -24,11 +24,20 @@ from cairn_server.store.store_rows import (
     CellRow,
     ChainedEntry,
     Contribution,
+    MarkBox,
+    MarkChange,
     NamedCommit,
     Selection,
     Totals,
 )
-from cairn_server.store.stored_columns import cell_row, epoch_from_column, log_entry
+from cairn_server.store.stored_columns import (
+    cell_row,
+    corner_conditions,
+    corner_values,
+    epoch_from_column,
+    log_entry,
+    mark_change,
+)
 from cairn_server.store.tiles import Box, is_in_box
 
 PARENT, SEEN, PLACE, NOTE = (
@@ -255,6 +264,10 @@ class SqliteSnapshot:
             for seq, kind, robot, incarnation, n, sha, chain in found
         ]
 
+    def marks(self, *, after_seq: int, limit: int, box: MarkBox | None = None) -> list[MarkChange]:
+        """Marks that changed after a log entry, in a box, oldest first: whole entries, with `limit` marks or more."""
+        return _changed_marks(self._connection, self._map, after_seq=after_seq, limit=limit, box=box)
+
     def totals(self) -> Totals:
         """Sizes."""
         sums, corners = totals_of(self._connection, self._map)
@@ -277,3 +290,26 @@ class SqliteSnapshot:
 
 def _vector(found: list[tuple[Any, ...]]) -> VersionVector:
     return EMPTY.with_commits(CommitId(Author(robot, incarnation), n) for robot, incarnation, n in found)
+
+
+def _changed_marks(
+    connection: apsw.Connection, map_number: int, *, after_seq: int, limit: int, box: MarkBox | None
+) -> list[MarkChange]:
+    """Marks changed after a log entry, in a box, by entry and number; as `Snapshot.marks`."""
+    where: str = "map = ? AND changed_seq > ?"
+    values: tuple[int, ...] = (map_number, after_seq)
+    if box is not None:
+        where, values = f"{where} AND {corner_conditions('?')}", (*values, *corner_values(box))
+    # A page ends with an entry, that of its last row, which is found along the index alone: it has the corners, too.
+    query = f"SELECT changed_seq FROM mark WHERE {where} ORDER BY changed_seq LIMIT 1 OFFSET ?"  # noqa: S608 - our own clause
+    last = first(connection, query, (*values, limit - 1))
+    if last is not None:
+        where, values = f"{where} AND changed_seq <= ?", (*values, last)
+    found = rows(
+        connection,
+        "SELECT changed_seq, robot, incarnation, commits.n, mark.n, record, retracts FROM"  # noqa: S608 - our own clause
+        f" (SELECT * FROM mark WHERE {where}) AS mark JOIN commits ON commits.number = commit_number"
+        " ORDER BY changed_seq, mark.n",
+        values,
+    )
+    return [mark_change(*row) for row in found]

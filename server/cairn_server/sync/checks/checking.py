@@ -62,6 +62,7 @@ def new_commit(commit: Commit, tops: Mapping[int, tuple[int, ...]], *, bricks: i
         bricks=bricks,
         rig=bytes.fromhex(commit.meta.rig) if commit.meta.rig else None,
         epoch=commit.meta.row,
+        marks=commit.meta.marks,
     )
 
 

@@ -13,7 +13,8 @@ import numpy.typing as npt
 from cairn_map.codec.cell_code import CanonicalCell
 from cairn_map.codec.octree.cell_content import CellContent
 from cairn_map.commits.commit import CommitMeta
-from cairn_map.commits.ids import INITIAL
+from cairn_map.commits.ids import INITIAL, OPERATOR
+from cairn_map.commits.mark import check_place
 from cairn_map.epochs.epoch import Epoch, begin_s, epoch_of
 from cairn_map.errors import BadInputError, DamagedDataError, DeniedError, UnreachableError
 from cairn_map.evidence.channels import SAMPLE_MAX, planes_and_squares
@@ -33,7 +34,8 @@ def check_claims(row: MapRow, caller: Caller, id_text: str, meta: CommitMeta, *,
     """Refuse a commit by its meta alone, before its evidence is decoded.
 
     Raises:
-        BadInputError: kind `other_id`, `other_geometry`, `other_layer`, `reserved_name` or `bad_commit`.
+        BadInputError: kind `other_id`, `other_geometry`, `other_layer`, `reserved_name`, `bad_commit`, `bad_mark` or
+            `bad_place`.
         DeniedError: kind `not_allowed`: made by, or retracting from, a robot that the caller is not.
         DamagedDataError: kind `empty_commit`.
     """
@@ -49,8 +51,14 @@ def check_claims(row: MapRow, caller: Caller, id_text: str, meta: CommitMeta, *,
     times = [*(meta.captured_s or ()), *(scan.time_s for scan in meta.scans)]
     if any(abs(time_s) > TIME_MAX_S for time_s in times):
         raise BadInputError("bad_commit", f"a time of the commit is beyond {TIME_MAX_S:g} s since 1970")
-    if not cells and not meta.retracts:
-        raise DamagedDataError("empty_commit", "a commit must hold evidence or name commits to retract")
+    if not cells and not meta.retracts and not meta.marks:
+        raise DamagedDataError("empty_commit", "a commit must hold evidence or marks, or name commits to retract")
+    for mark in meta.marks:
+        check_place(mark, row.geometry)
+        # Who reads `by` trusts the server that wrote it: a robot has no other name than its own.
+        if mark.by and meta.commit_id.author.robot != OPERATOR:
+            said = f"the mark {mark.name!r} speaks for {mark.by!r}; a robot marks in its own name, without `by`"
+            raise BadInputError("bad_mark", said)
 
 
 def check_epoch(epoch: Epoch, epoch_s: int, *, now_s: float) -> None:

@@ -25,7 +25,8 @@ from cairn_map.errors import ConflictError, NotFoundError
 from cairn_map.evidence.grid import Geometry
 from cairn_server.store.objects.cold_bytes import ColdReads, split_cell_object
 from cairn_server.store.postgres.connections import Connection, Connections, first, rows
-from cairn_server.store.postgres.store import NUMBER_BITS, bar_older_programs
+from cairn_server.store.postgres.schema import EPOCHS_OLDEST, MARKS_OLDEST, bar_older_programs
+from cairn_server.store.postgres.store import NUMBER_BITS
 from cairn_server.store.shares import limits_of
 from cairn_server.store.stored_columns import TableRows
 
@@ -40,8 +41,9 @@ TABLES = {
     "cell": "cell, lm, digest, fingerprint, voxels, size_bytes, gone_seq, hottest_k, history_bytes, body, stamps,"
     " object",
     "tile": "tile, lm, cells, size_bytes, fingerprint, history_bytes",
+    "mark": "commit_number, n, changed_seq, low_x, low_y, low_z, high_x, high_y, high_z, record",
     "held": "account, region, tops, part",
-    "author": "robot, incarnation, top, intervals, closed, kept_bytes",
+    "author": "robot, incarnation, top, intervals, closed, kept_bytes, marks",
     "vector_mark": "seq, vector",
     "robot_key": "robot, incarnation, is_proven, may_return, since_s, by",
     "branch": "name, mode, sensors, cursor, last_seen_s, incarnation",
@@ -52,6 +54,7 @@ MAP = (
     "SELECT map, name, geometry, sensor_model, seal_key, epoch_s, log_id, seq, chain, folded, cells, cells_bytes,"
     " fingerprint, history_bytes, corners FROM map JOIN head USING (map) WHERE name = %s"
 )
+HAS_MARKS = "SELECT EXISTS (SELECT FROM mark WHERE map = %s)"
 HEAD = ("log_id", "seq", "chain", "folded", "cells", "cells_bytes", "fingerprint", "history_bytes")
 BOOLEANS = frozenset({"closed", "gone", "is_proven", "may_return"})
 ARRAYS = frozenset({"regions", "tops", "corners"})
@@ -170,6 +173,8 @@ class _Putting:
             self._write("commits", self._numbered(found), " OVERRIDING SYSTEM VALUE")
         else:
             self._write(table.name, map(self._here, found))
+        if table.name == "mark" and first(self._connection, HAS_MARKS, (self.number,)):
+            self._bar_older("marks", MARKS_OLDEST)
 
     def _map(self, values: Mapping[str, Any]) -> None:
         self.name = values["name"]
@@ -182,9 +187,12 @@ class _Putting:
         if not made.rowcount:
             raise ConflictError("map_exists", f"the store has a map {self.name}: delete it first")
         if values["epoch_s"] is not None:
-            bar_older_programs(self._connection)
+            self._bar_older("maps with epochs", EPOCHS_OLDEST)
         corners = list(chain.from_iterable(json.loads(values["corners"]))) if values["corners"] else None
         self._write("head", iter([{name: values[name] for name in HEAD} | {"corners": corners}]))
+
+    def _bar_older(self, what: str, oldest: int) -> None:
+        bar_older_programs(self._connection, oldest, what=what, instead="put the map into another store")
 
     def _numbered(self, found: Iterable[dict[str, Any]]) -> Iterator[dict[str, Any]]:
         """Commits with numbers of this database, in the same order."""

@@ -33,6 +33,7 @@ TABLES = (
     "retracted",
     "cell",
     "tile",
+    "mark",
     "held",
     "author",
     "vector_mark",

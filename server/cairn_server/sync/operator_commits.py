@@ -1,0 +1,79 @@
+"""Commits that a server makes for its operators: their author, and numbers that this server never used before."""
+
+from collections.abc import Callable
+
+from cairn_map.commits.commit import CommitMeta, make_commit
+from cairn_map.commits.ids import OPERATOR, Author, CommitId, new_incarnation
+from cairn_map.commits.mark import Mark
+from cairn_map.errors import ConflictError
+from cairn_server.store.store import Store
+from cairn_server.store.store_rows import MapRow, NewCommit
+
+
+class OperatorCommits:
+    """Commits without evidence by `operator`, on all maps of a store; called from many threads."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self.operator = new_incarnation()
+        """Incarnation of the author, new with every start: a restored server must not reuse the numbers it lost."""
+        self._next: dict[tuple[int, Author], int] = {}
+        """Next number, by map and author; a lower one says that the store was restored while this server ran."""
+
+    def append(
+        self, row: MapRow, *, retracts: tuple[CommitId, ...] = (), note: str = "", marks: tuple[Mark, ...] = ()
+    ) -> CommitId:
+        """Keep a commit that takes others out, or brings marks, or both; durable on return.
+
+        Raises:
+            ConflictError: kind `evidence_gone`.
+            BadInputError: kind `too_many_marks`.
+        """
+        author = Author(OPERATOR, self.operator)
+        build = _builder(row, author, retracts, note, marks)
+
+        def build_next(n: int) -> NewCommit:
+            if n < self._next.get((row.number, author), 0):
+                raise _LostNumberError("id_taken", f"{CommitId(author, n)} was another commit, which was lost")
+            self._next[row.number, author] = n + 1
+            return build(n)
+
+        try:
+            return self._store.append_built(row, author, build_next).id
+        except _LostNumberError:
+            self.operator = new_incarnation()
+            return self.append(row, retracts=retracts, note=note, marks=marks)
+
+
+class _LostNumberError(ConflictError):
+    """The next number of an author is one that this server has used."""
+
+
+def _builder(
+    row: MapRow, author: Author, retracts: tuple[CommitId, ...], note: str, marks: tuple[Mark, ...]
+) -> Callable[[int], NewCommit]:
+    has_layers = row.layer.has_epochs and not marks
+
+    def build(n: int) -> NewCommit:
+        meta = CommitMeta(
+            id=str(CommitId(author, n)),
+            geometry=None if has_layers else row.geometry.digest().hex(),
+            layers=row.layer.identities if has_layers else (),
+            retracts=tuple(map(str, retracts)),
+            note=note,
+            marks=marks,
+        )
+        commit = make_commit(meta, {}, row.layer)
+        return NewCommit(
+            id=commit.id,
+            sha=commit.sha,
+            size_bytes=len(commit.data),
+            text=commit.text,
+            captured_s=None,
+            retracts=meta.retracted_ids,
+            diff={},
+            tops={},
+            marks=marks,
+        )
+
+    return build
