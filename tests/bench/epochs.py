@@ -13,6 +13,7 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+from tests.bench.following import traffic_rows
 from tests.bench.forgetting import forgetting_rows
 from tests.bench.moving import change_rows, static_rows
 from tests.bench.timing import cpu_s
@@ -49,6 +50,7 @@ def epoch_rows(smoke: bool) -> Iterator[Row]:
     yield from static_rows(smoke)
     yield from change_rows(smoke)
     yield from pass_rows(smoke)
+    yield from traffic_rows(smoke)
 
 
 def pass_rows(smoke: bool) -> Iterator[Row]:

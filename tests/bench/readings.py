@@ -39,7 +39,7 @@ POINTS = 300_000
 def reading_rows(smoke: bool) -> Iterator[Row]:
     """One line each."""
     geometry = Geometry()
-    passes = _passes(geometry, stops=2 if smoke else 9, yaws=4 if smoke else 12)
+    passes = room_passes(geometry, stops=2 if smoke else 9, yaws=4 if smoke else 12)
     rows, sums = HistoryMap(MapLayer(geometry=geometry, epoch_s=120), coding=coding_of(geometry)), EvidenceMap(geometry)
     reading = MapReading(rows)
     per_brick_us: list[float] = []
@@ -109,7 +109,7 @@ def _query_rows(sums: EvidenceMap, reading: MapReading, *, repeats: int) -> Iter
         yield f"  first snapshot of the {name}", f"{1e3 * seconds:.1f}", "ms CPU"
 
 
-def _passes(geometry: Geometry, *, stops: int, yaws: int) -> list[list[Diff]]:
+def room_passes(geometry: Geometry, *, stops: int, yaws: int) -> list[list[Diff]]:
     """Commits by pass."""
     robot = replace(ROBOTS["orpheus"], scans=(yaws, 3))
     plan = Plan(scene=load_scene("small-room"), robot=robot, path="west", scale=0.25, truth="none", last_stop=stops)

@@ -17,7 +17,9 @@ from cairn_client.replica.replica_store import FILE_NAME
 from cairn_map.codec.cell_code import coding_of, decode_cell
 from cairn_map.codec.cell_reading import EVIDENCE_BYTES_MAX
 from cairn_map.codec.layer_code import row_bodies
+from cairn_map.epochs.epoch import BASE, begin_s
 from cairn_map.epochs.history_map import HistoryMap
+from cairn_map.epochs.map_reading import BlockTimes
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.grid import CellKey, cell_of_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
@@ -33,7 +35,7 @@ class FolderMap:
 
     snapshot: MapSnapshot
     ages: Ages | None
-    """Ages of what the robot measured itself; None for a folder of cells, which have no times."""
+    """Ages of all that has a time in a map with epochs; else of what the robot measured itself, None of mere cells."""
 
 
 def open_map(
@@ -82,14 +84,14 @@ def map_of_folder(folder: Path, *, at_s: float | None = None) -> FolderMap:
     """
     if is_state_folder(folder):
         with opened_replica(folder) as replica:
-            return FolderMap(replica.snapshot(at_s=at_s), ages_of(replica))
+            return FolderMap(replica.snapshot(at_s=at_s), row_ages(replica.view, at_s) or ages_of(replica))
     if (folder / MAP_FILE).is_file():
         head = read_head(folder)
         whole = HistoryMap(head.layer, coding=coding_of(head.geometry))
         for cell in read_cells(folder, head.layer):
             size_bytes = cell_path(folder, cell_of_key(cell.key)).stat().st_size
             whole.replace(cell.key, cell.history, came_bytes=size_bytes)
-        return FolderMap(_snapshot(whole, head.sensor_model, at_s), None)
+        return FolderMap(_snapshot(whole, head.sensor_model, at_s), row_ages(whole, at_s))
     raise BadInputError(
         "no_map_folder",
         f"{folder} holds no map: neither {MAP_FILE} and cells (`cairn map export URL --cells DIR`) nor a robot's "
@@ -131,6 +133,19 @@ def _too_large(map_url: str, memory_bytes_max: int) -> BadInputError:
         f"{map_url} takes more than {memory_bytes_max} bytes in memory (memory_bytes_max): give it more, or save a "
         "part of it with `cairn map export --box --npz FILE`",
     )
+
+
+def row_ages(whole: HistoryMap, at_s: float | None) -> Ages | None:
+    """Ages in a map with epochs, to the length of one, as of a time; with None as of the begin of the newest epoch.
+
+    None of a map without epochs, and where no evidence has a time.
+    """
+    epoch_s, newest = whole.layer.epoch_s, max(whole.epochs, default=BASE)
+    if epoch_s is None or newest == BASE:
+        return None
+    if at_s is None:
+        return Ages(BlockTimes(whole), now=begin_s(newest, epoch_s))
+    return Ages(BlockTimes(whole, at=whole.layer.epoch_at(at_s)), now=at_s)
 
 
 def ages_of(replica: Replica) -> Ages | None:

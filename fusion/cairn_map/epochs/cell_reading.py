@@ -7,7 +7,7 @@ It is, bit for bit, the reading that `present` makes of all rows. When another r
 read from its rows again. What is closed is made when the newest row first grows, and may be dropped at any time.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -16,8 +16,16 @@ import numpy.typing as npt
 
 from cairn_map.arrays import Floats, Words32
 from cairn_map.epochs.cell_history import CellHistory, cell_history
-from cairn_map.epochs.epoch import BASE, Epoch, begin_s
-from cairn_map.epochs.present import ReadCounts, ShownSamples, counts_of_rows, present, voxels_of_rows
+from cairn_map.epochs.epoch import BASE, Epoch, begin_s, times_of_epochs
+from cairn_map.epochs.layer import MapLayer
+from cairn_map.epochs.present import (
+    ReadCounts,
+    ShownSamples,
+    counts_of_rows,
+    present,
+    present_of_rows,
+    voxels_of_rows,
+)
 from cairn_map.epochs.present_kernels import JOINED_MIN, number_words_into
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.brick_cell import BrickCell, reading_cell
@@ -249,6 +257,46 @@ def voxel_times_s(rows: Rows, voxels: Words32, epoch_s: int) -> Floats:
         is_seen = (counts != 0).any(axis=1)[np.searchsorted(rising, voxels)]
         seen[left & is_seen] = begin_s(epoch, epoch_s)
     return seen
+
+
+def block_times_s(rows: Iterable[tuple[float, Evidence]], depth: int) -> Floats:
+    """(8^(depth - 2),) newest time of each block of 4^3 voxels of a cell; NaN where no row with a time has evidence.
+
+    Args:
+        rows: times, UTC seconds since 1970 or NaN, and what was measured then, in any order.
+        depth: octree depth of the cell's voxels.
+    """
+    times = np.full(8 ** (depth - 2), np.nan)
+    for time_s, evidence in rows:
+        blocks = np.unique(evidence.voxels >> np.uint32(6))
+        times[blocks] = np.fmax(times[blocks], time_s)
+    return times
+
+
+def sample_times_s(rows: Rows, voxels: Words32, layer: MapLayer, model: SensorModel) -> Floats:
+    """(V, C) first instant of the newest epoch of which samples of each channel are shown, UTC seconds since 1970.
+
+    Args:
+        rows: the cell's.
+        voxels: (V,) Morton codes inside the cell, in any order, also several times.
+        layer: a map's with epochs.
+        model: inverse sensor model: samples of what was seen through since are not shown.
+
+    Returns:
+        NaN where no samples are shown, or none with a time.
+    """
+    epochs, rising = sorted(rows), np.unique(voxels)
+    read = present_of_rows(epochs, [_among(rows[epoch].packed(), rising) for epoch in epochs], layer.geometry, model)
+    times = np.full((len(rising), len(layer.geometry.channels)), np.nan)
+    times[np.searchsorted(rising, read.voxels[read.sampled])] = times_of_epochs(read.sampled_in, layer.epoch_s or 0)
+    return times[np.searchsorted(rising, voxels)]
+
+
+def _among(evidence: Evidence, voxels: Words32) -> Evidence:
+    """Evidence of some voxels, rising, as far as there is any."""
+    keep = np.zeros(len(evidence), np.bool_)
+    keep[_places(voxels, evidence.voxels)[1]] = True
+    return evidence.where(keep)
 
 
 def _history(rows: Rows) -> CellHistory:

@@ -9,6 +9,9 @@ the *base*, which is older than every epoch.
 import math
 from typing import NewType
 
+import numpy as np
+
+from cairn_map.arrays import Floats, Ints
 from cairn_map.errors import BadInputError
 
 Epoch = NewType("Epoch", int)
@@ -45,6 +48,12 @@ def epoch_of(time_s: float, epoch_s: int) -> Epoch:
 def begin_s(epoch: Epoch, epoch_s: int) -> float:
     """First instant of an epoch, UTC seconds since 1970; minus infinity for the base."""
     return -math.inf if epoch == BASE else float(epoch * epoch_s)
+
+
+def times_of_epochs(epochs: Ints, epoch_s: int) -> Floats:
+    """First instants of epochs, UTC seconds since 1970; NaN for the base, whose evidence has no time."""
+    is_base = epochs == BASE
+    return np.where(is_base, np.nan, np.where(is_base, 0, epochs) * np.float64(epoch_s))
 
 
 def check_epoch(epoch: int) -> Epoch:

@@ -14,8 +14,8 @@ from cairn_map.epochs.cell_history import CellHistory, cell_history
 from cairn_map.epochs.epoch import BASE, Epoch
 from cairn_map.epochs.layer import MapLayer
 from cairn_map.epochs.map_reading import MapReading
-from cairn_map.evidence.brick_cell import BrickCell
-from cairn_map.evidence.compact_cell import CellCoding, HeldCell, VoxelTimes
+from cairn_map.evidence.brick_cell import BrickCell, difference
+from cairn_map.evidence.compact_cell import CellCoding, CompactCell, HeldCell, VoxelTimes
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.evidence_map import NO_BODIES, Bodies, Diff, EvidenceMap
 from cairn_map.evidence.grid import CellKey, Geometry
@@ -135,14 +135,24 @@ class HistoryMap:
             bodies: bytes of these very rows, each as a cell file of version 1, as far as the caller has them.
             came_bytes: bytes that came for the cell.
         """
-        for epoch in self._rows.keys() - history.rows.keys():
+        newest = max(history, default=BASE)
+        self._of(newest)  # before the others are looked at, which are bytes from then on
+        gone = [epoch for epoch in self._rows.keys() - history.rows.keys() if key in self._rows[epoch]]
+        changed = [epoch for epoch in history if not _is_held_as(self._of(epoch).held(key), bodies.get(epoch))]
+        if self._reading is not None:
+            if gone or changed not in ([], [newest]):
+                self._reading.forget((key,))
+            elif changed:
+                # What a robot follows grows at its newest row: the reading need not be made of all rows again.
+                diff = difference(history.rows[newest], self._of(newest).evidence(key), self.geometry)
+                self._reading.note({key: diff}, epoch=newest, sign=1)
+        for epoch in gone:
             self._rows[epoch].drop(key)
-        for epoch, row in history.rows.items():
-            self._of(epoch).replace(key, row, body=bodies.get(epoch), came_bytes=came_bytes)
+        for epoch in changed:
+            row, body = history.rows[epoch], bodies.get(epoch)
+            self._of(epoch).replace(key, row, body=body, came_bytes=came_bytes)
         self._shown.pop(key, None)
         self._touched.add(key)
-        if self._reading is not None:
-            self._reading.forget((key,))
 
     def show(self, key: CellKey, reading: HeldCell) -> None:
         """Show a cell as this reading, made by the server, until rows of it come (rule S6)."""
@@ -181,7 +191,7 @@ class HistoryMap:
         return dict(sorted((cells | shown).items())) if shown else cells
 
     def frozen_times(self) -> VoxelTimes | None:
-        """Times at which voxels were seen last; None in a map without epochs."""
+        """Times of voxels and of their samples; None in a map without epochs."""
         return MapReading(self).frozen_times()
 
     def rows(self, key: CellKey) -> dict[Epoch, HeldCell]:
@@ -222,6 +232,11 @@ class HistoryMap:
             self._rows[epoch] = EvidenceMap(self.geometry, coding=self._coding)
             self._rows[min(newest, epoch)].rest()
         return self._rows[epoch]
+
+
+def _is_held_as(held: HeldCell | None, body: bytes | None) -> bool:
+    """True if a row is held as these very bytes."""
+    return isinstance(held, CompactCell) and held.data == body
 
 
 def is_of_model(cell: HeldCell, model: SensorModel) -> bool:

@@ -7,15 +7,15 @@ A map that keeps one reports each merge by `note`, and any other change by `forg
 cells again. A cell whose rows have few bytes and whose reading would take much memory is read where it is asked for.
 """
 
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Protocol
 
 from cairn_map.arrays import Floats, Words32
 from cairn_map.epochs.cell_history import cell_history
-from cairn_map.epochs.cell_reading import CellReading, Rows, voxel_times_s
-from cairn_map.epochs.epoch import Epoch
+from cairn_map.epochs.cell_reading import CellReading, Rows, block_times_s, sample_times_s, voxel_times_s
+from cairn_map.epochs.epoch import BASE, Epoch, begin_s
 from cairn_map.epochs.layer import MapLayer
 from cairn_map.epochs.present import present
 from cairn_map.evidence.brick_cell import BrickCell, reading_cell
@@ -122,8 +122,9 @@ class MapReading:
         return {key: self._frozen(key, model) for key in keys}
 
     def frozen_times(self) -> VoxelTimes | None:
-        """Times at which voxels were seen last, read from the rows where they are asked for."""
-        epoch_s = self._whole.layer.epoch_s
+        """Times of voxels and of their samples, read from the rows where they are asked for."""
+        layer = self._whole.layer
+        epoch_s = layer.epoch_s
         if epoch_s is None:
             return None
         whole, at = self._whole.copy(), self._at
@@ -131,7 +132,10 @@ class MapReading:
         def seen(key: CellKey, voxels: Words32) -> Floats:
             return voxel_times_s(_until(whole.rows(key), at), voxels, epoch_s)
 
-        return seen
+        def measured(key: CellKey, voxels: Words32, model: SensorModel) -> Floats:
+            return sample_times_s(_until(whole.rows(key), at), voxels, layer, model)
+
+        return VoxelTimes(seen, measured)
 
     def _frozen(self, key: CellKey, model: SensorModel) -> HeldCell:
         if key in self._compact:
@@ -150,6 +154,32 @@ class MapReading:
         frozen = {epoch: row.copy() if isinstance(row, BrickCell) else row for epoch, row in rows.items()}
         self._compact[key] = CompactReading(frozen, self.geometry, model)
         return self._compact[key]
+
+
+class BlockTimes(Mapping[CellKey, Floats]):
+    """First instant of the newest epoch of each block of 4^3 voxels of a map's cells, as `block_times_s` has them.
+
+    Cells are read where they are asked for, each once.
+    """
+
+    def __init__(self, whole: EpochMap, *, at: Epoch | None = None) -> None:
+        """Times of a map with epochs as it is now, or of what was captured up to an epoch."""
+        self._whole = whole.copy()
+        self._at = at
+        self._kept: dict[CellKey, Floats] = {}
+
+    def __getitem__(self, key: CellKey) -> Floats:
+        if key not in self._kept:
+            layer, rows = self._whole.layer, _until(self._whole.rows(key), self._at)
+            dated = ((begin_s(epoch, layer.epoch_s or 0), row.packed()) for epoch, row in rows.items() if epoch != BASE)
+            self._kept[key] = block_times_s(dated, layer.geometry.depth)
+        return self._kept[key]
+
+    def __iter__(self) -> Iterator[CellKey]:
+        return iter(self._whole)
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self._whole)
 
 
 def _sums_bytes_max(row: HeldCell) -> int:

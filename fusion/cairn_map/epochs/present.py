@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from cairn_map.arrays import Floats
 from cairn_map.epochs.cell_history import CellHistory
-from cairn_map.epochs.epoch import BASE, Epoch
+from cairn_map.epochs.epoch import BASE, Epoch, times_of_epochs
 from cairn_map.epochs.layer import MapLayer
 from cairn_map.epochs.present_kernels import add_counts_into, join_samples_into
 from cairn_map.evidence.channels import ChannelKind, planes_and_squares
@@ -72,8 +72,15 @@ class Present:
     @property
     def evidence(self) -> Evidence:
         """The reading as evidence with `odds`, as all queries, views and files read it; counts end at `COUNT_MAX`."""
+        return self._evidence(None)
+
+    def dated_evidence(self, epoch_s: int) -> Evidence:
+        """`evidence` with the times of its samples, in a map whose epochs are as long."""
+        return self._evidence(times_of_epochs(self.sampled_in, epoch_s))
+
+    def _evidence(self, measured_s: Floats | None) -> Evidence:
         counts = np.minimum(self.counts, COUNT_MAX).astype(np.int32)
-        whole = Evidence(self.voxels, counts, self.sampled, self.samples, self.log_odds)
+        whole = Evidence(self.voxels, counts, self.sampled, self.samples, self.log_odds, measured_s)
         keep = self.known
         keep[self.sampled] = True
         return whole if keep.all() else whole.where(keep)
@@ -214,7 +221,7 @@ def _epochs_of(numbers: npt.NDArray[np.int32], epochs: npt.NDArray[np.int64]) ->
 
 
 def shown_evidence(history: CellHistory, layer: MapLayer, model: SensorModel, *, at: Epoch | None = None) -> Evidence:
-    """Evidence of a cell as it is read: its sums in a map without epochs, else the reading of its rows.
+    """Evidence of a cell as it is read: its sums in a map without epochs, else the dated reading of its rows.
 
     Args:
         history: its rows, of which no number is negative.
@@ -222,6 +229,6 @@ def shown_evidence(history: CellHistory, layer: MapLayer, model: SensorModel, *,
         model: inverse sensor model of the reading.
         at: last epoch that is read; None: all are.
     """
-    if not layer.has_epochs:
+    if layer.epoch_s is None:
         return history.rows.get(BASE) or empty_evidence(layer.geometry)
-    return present(history, layer.geometry, model, at=at).evidence
+    return present(history, layer.geometry, model, at=at).dated_evidence(layer.epoch_s)

@@ -9,13 +9,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-import numpy as np
-import numpy.typing as npt
-
-from cairn_map.arrays import Floats
+from cairn_map.arrays import Floats, Words32
 from cairn_map.evidence.brick_cell import BrickCell, brick_cell
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey, Geometry
+from cairn_map.evidence.inverse_sensor_model import SensorModel
 
 HELD_PER_BYTE = 190
 """Most bytes of sums that are held for each byte that came. With the rest of what a robot keeps of a cell it stays
@@ -73,9 +71,14 @@ HeldCell = BrickCell | ClosedCell
 """A cell of a map in memory: its sums or a reading of them, or that of which these are made."""
 
 
-VoxelTimes = Callable[[CellKey, npt.NDArray[np.uint32]], Floats]
-"""Times at which voxels of a cell were seen last: (N,) UTC seconds since 1970 of (N,) Morton codes inside it; NaN where
-nothing was seen, or nothing that has a time."""
+@dataclass(frozen=True, slots=True)
+class VoxelTimes:
+    """Times of N voxels of a cell, Morton codes inside it: UTC seconds since 1970, NaN where there is none."""
+
+    seen: Callable[[CellKey, Words32], Floats]
+    """(N,) when they were hit or seen through last."""
+    measured: Callable[[CellKey, Words32, SensorModel], Floats]
+    """(N, C) when the samples of each channel were measured last that are shown under a sensor model."""
 
 
 def opened(cell: HeldCell) -> BrickCell:

@@ -5,6 +5,7 @@
     sampled  (S,)   uint32  rows of `voxels` that have samples, rising
     samples  (S, P) int64   sums, in the order of `Geometry.channels` and their planes
     odds     (V,)   float64 log-odds, if it is a reading of evidence by epoch; None: they follow from the counts
+    measured_s  (S, C)  float64 when each channel's samples were measured, if it is a reading that says so
 
 Packed evidence is canonical: a voxel is there if and only if one of its numbers is not zero. Evidence
 that robots make is never negative; only the difference between two states of a map may be.
@@ -39,6 +40,9 @@ class Evidence:
     samples: npt.NDArray[np.int64]
     odds: Floats | None = None
     """(V,) log-odds clamped from epoch to epoch under one sensor model (rule R1), 0 where unknown; None: of sums."""
+    measured_s: Floats | None = None
+    """(S, C) first instant of the newest epoch of each channel's samples (rule R4), UTC seconds since 1970; NaN where
+    there are none, or none with a time; None: of sums, and of readings whose times were not asked for."""
 
     def __post_init__(self) -> None:
         V, S = self.voxels.shape[:1], self.sampled.shape[:1]
@@ -49,6 +53,8 @@ class Evidence:
             raise BadInputError("bad_evidence", f"arrays do not fit: {[(a.dtype.name, a.shape) for a in arrays]}")
         if self.odds is not None and (self.odds.shape != V or self.odds.dtype != np.float64):
             raise BadInputError("bad_evidence", f"odds must be float64 {V}, got {self.odds.dtype} {self.odds.shape}")
+        if self.measured_s is not None and self.measured_s.shape[:-1] != S:
+            raise BadInputError("bad_evidence", f"measured_s must be {S} by channels, got {self.measured_s.shape}")
 
     def __hash__(self) -> int:
         return hash((len(self.voxels), len(self.sampled)))
@@ -70,8 +76,8 @@ class Evidence:
     @property
     def size_bytes(self) -> int:
         """Memory held by the arrays."""
-        odds = 0 if self.odds is None else self.odds.nbytes
-        return self.voxels.nbytes + self.counts.nbytes + self.sampled.nbytes + self.samples.nbytes + odds
+        optional = sum(array.nbytes for array in (self.odds, self.measured_s) if array is not None)
+        return self.voxels.nbytes + self.counts.nbytes + self.sampled.nbytes + self.samples.nbytes + optional
 
     @property
     def brick_count(self) -> int:
@@ -110,6 +116,7 @@ class Evidence:
             new_row[self.sampled[kept]].astype(np.uint32),
             self.samples[kept],
             None if self.odds is None else self.odds[keep],
+            None if self.measured_s is None else self.measured_s[kept],
         )
 
 

@@ -111,6 +111,10 @@ class View:
         scaled: npt.NDArray[np.uint8] = np.rint(self.rgb * 255 / np.array(TOPS[self.style.colours])).astype(np.uint8)
         return scaled
 
+    def rows_of(self, nodes: npt.NDArray[np.uint32]) -> Ints:
+        """(S,) row of each node of its depth; -1 where the view does not hold it."""
+        return _rows_of(nodes, self.nodes)
+
     @property
     def temperature_k(self) -> Floats:
         """(W, 1 or 2) mean temperatures, and of inner nodes the hottest voxels'; kelvin."""

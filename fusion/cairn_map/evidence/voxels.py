@@ -3,7 +3,8 @@
 Floats begin here: probabilities are clamped here, means are taken here, and nowhere earlier.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -28,6 +29,9 @@ class Reading:
     weight: npt.NDArray[np.int64]
     spread: Floats | None = None
     """(N,) standard deviation of the samples, temperature only; 0 of a single sample."""
+    measured_s: Floats | None = None
+    """(N,) first instant of the epoch of the newest samples, UTC seconds since 1970, NaN where unknown; None: not asked
+    for, or of a map without epochs."""
 
     @property
     def sigma(self) -> Floats | None:
@@ -36,8 +40,8 @@ class Reading:
 
     def rows(self, rows: npt.NDArray[np.int64]) -> "Reading":
         """Reading of the voxels in these rows alone, in this order."""
-        spread = None if self.spread is None else self.spread[rows]
-        return Reading(self.channel, self.mean[rows], self.weight[rows], spread)
+        spread, measured_s = (None if array is None else array[rows] for array in (self.spread, self.measured_s))
+        return Reading(self.channel, self.mean[rows], self.weight[rows], spread, measured_s)
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +80,11 @@ def voxels_of_evidence(
         channel.name: reading_of_sums(channel, samples[keep][:, geometry.planes_of(channel.name)])
         for channel in geometry.channels
     }
+    if evidence.measured_s is not None:
+        times = np.full((len(evidence), len(geometry.channels)), np.nan)
+        times[evidence.sampled] = evidence.measured_s
+        dated = zip(readings.items(), times[keep].T, strict=True)
+        readings = {name: replace(reading, measured_s=mine) for (name, reading), mine in dated}
     probability = evidence.probability(model, rows=keep)
     return Voxels(numbers, centres_of_voxels(numbers, geometry), counts, probability, readings)
 
@@ -85,10 +94,9 @@ def joined_voxels(parts: list[Voxels]) -> Voxels:
     readings: dict[str, Reading] = {}
     for name, first in parts[0].readings.items():
         mine = [part.readings[name] for part in parts]
-        spread = None if first.spread is None else np.concatenate([r.spread for r in mine if r.spread is not None])
-        readings[name] = Reading(
-            first.channel, np.concatenate([r.mean for r in mine]), np.concatenate([r.weight for r in mine]), spread
-        )
+        spread, measured_s = (_joined(arrays) for arrays in zip(*((r.spread, r.measured_s) for r in mine), strict=True))
+        mean, weight = np.concatenate([r.mean for r in mine]), np.concatenate([r.weight for r in mine])
+        readings[name] = Reading(first.channel, mean, weight, spread, measured_s)
     return Voxels(
         np.concatenate([part.numbers for part in parts]),
         np.concatenate([part.centres_m for part in parts]),
@@ -96,6 +104,17 @@ def joined_voxels(parts: list[Voxels]) -> Voxels:
         np.concatenate([part.probability for part in parts]),
         readings,
     )
+
+
+def measured_or_none(reading: Reading, row: int) -> float | None:
+    """Time of the newest samples of the voxel in a row, as messages state it; None: unknown."""
+    measured_s = None if reading.measured_s is None else float(reading.measured_s[row])
+    return None if measured_s is None or np.isnan(measured_s) else measured_s
+
+
+def _joined(arrays: Sequence[Floats | None]) -> Floats | None:
+    there = [array for array in arrays if array is not None]
+    return np.concatenate(there) if there else None
 
 
 def reading_of_sums(channel: Channel, sums: npt.NDArray[np.int64]) -> Reading:

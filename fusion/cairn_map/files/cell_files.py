@@ -20,6 +20,12 @@ MEDIA_TYPES = {
     "view": "application/vnd.cairn.view",
 }
 FORMS = "octree (no suffix), .npz, .ply or .view"
+NAMED = {
+    "colour": ChannelKind.COLOUR,
+    "temperature": ChannelKind.TEMPERATURE,
+    "intensity": ChannelKind.INTENSITY,
+}
+"""Channels of PLY files."""
 GREY = 128
 """Red, green and blue of voxels that no colour camera saw."""
 
@@ -44,12 +50,16 @@ def ply_file(voxels: Voxels) -> bytes:
     """Voxel centres as a binary little-endian PLY point cloud.
 
     Properties: x y z (float, metres, map frame), red green blue (uchar), probability (float), temperature (float,
-    kelvin, NaN where no thermal camera looked), intensity (float), hits, misses (int).
+    kelvin, NaN where no thermal camera looked), intensity (float), hits, misses (int); of a dated reading colour,
+    temperature and intensity `_measured_s` (double, UTC seconds since 1970, NaN where unknown).
     """
     N = len(voxels)
     fields: list[tuple[str, str]] = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
     fields += [(name, "u1") for name in ("red", "green", "blue")]
     fields += [("probability", "<f4"), ("temperature", "<f4"), ("intensity", "<f4"), ("hits", "<i4"), ("misses", "<i4")]
+    named = {name: voxels.of_kind(kind) for name, kind in NAMED.items()}
+    times = {f"{name}_measured_s": r.measured_s for name, r in named.items() if r and r.measured_s is not None}
+    fields += [(name, "<f8") for name in times]
     table = np.zeros(N, np.dtype(fields))
     for axis, name in enumerate("xyz"):
         table[name] = voxels.centres_m[:, axis]
@@ -57,18 +67,22 @@ def ply_file(voxels: Voxels) -> bytes:
     for c, name in enumerate(("red", "green", "blue")):
         table[name] = rgb[:, c]
     table["probability"] = voxels.probability
-    for name, kind in (("temperature", ChannelKind.TEMPERATURE), ("intensity", ChannelKind.INTENSITY)):
-        reading = voxels.of_kind(kind)
+    for name in ("temperature", "intensity"):
+        reading = named[name]
         table[name] = reading.mean if reading else np.nan
     table["hits"], table["misses"] = voxels.counts.T
-    words = {"<f4": "float", "u1": "uchar", "<i4": "int"}
+    for name, measured_s in times.items():
+        table[name] = measured_s
+    words = {"<f4": "float", "<f8": "double", "u1": "uchar", "<i4": "int"}
     head = ["ply", "format binary_little_endian 1.0", "comment cairn; metres, map frame; kelvin", f"element vertex {N}"]
     head += [f"property {words[code]} {name}" for name, code in fields] + ["end_header", ""]
     return "\n".join(head).encode() + table.tobytes()
 
 
 def npz_file(voxels: Voxels) -> bytes:
-    """Voxels as a compressed NPZ: numbers, centres_m, counts, probability, and per channel mean, weight, spread."""
+    """Voxels as a compressed NPZ: numbers, centres_m, counts, probability, and per channel mean, weight, spread,
+    and of a dated reading measured_s.
+    """
     arrays: dict[str, npt.NDArray[np.generic]] = {
         "numbers": voxels.numbers,
         "centres_m": voxels.centres_m,
@@ -79,6 +93,8 @@ def npz_file(voxels: Voxels) -> bytes:
         arrays[f"{name}_mean"], arrays[f"{name}_weight"] = reading.mean, reading.weight
         if reading.spread is not None:
             arrays[f"{name}_spread"] = reading.spread
+        if reading.measured_s is not None:
+            arrays[f"{name}_measured_s"] = reading.measured_s
     buffer = io.BytesIO()
     np.savez_compressed(buffer, allow_pickle=False, **arrays)
     return buffer.getvalue()

@@ -6,6 +6,7 @@ times 256). Values for which LAS has no field are its extra bytes, each a float 
     probability        0 to 1
     temperature        kelvin, mean below the node; NaN where no thermal camera looked
     hottest            kelvin, the hottest voxel below the node
+    times              UTC seconds since 1970 as a double, of a map with epochs; NaN where unknown
 
 LASzip writes the offset of its chunk table into the file's head at the end. A head that is sent already cannot be
 changed, and LASzip provides for that: the offset there is -1, and the file's last eight bytes hold it.
@@ -35,6 +36,8 @@ EXTRA = {
     "hottest": "kelvin, maximum; NaN: not seen",
 }
 """Descriptions of the extra bytes, at most 31 letters each."""
+TIME = "UTC s since 1970; NaN: unknown"
+"""Description of a time."""
 RETURN = 0x11
 """Bit field of a point: return number 1 of 1 return."""
 COLOUR_STEP = 256
@@ -52,10 +55,12 @@ class LazHead:
     node_edge_m: float
     frame: str
     """Name of the coordinate system."""
+    times: tuple[str, ...] = ()
+    """Names of the tables' fields that are times."""
 
 
 def laz_parts(head: LazHead, tables: Iterable[Table]) -> Iterator[bytes]:
-    """Parts of a LAZ file; `tables` are (N,) of `point_clouds.POINT`, `count` points together."""
+    """Parts of a LAZ file; `tables` are (N,) of `point_clouds.POINT` and the times, `count` points."""
     sink, header = _Uncorrected(), _header(head)
     vlr = lazrs.LazVlr.new_for_compression(POINT_FORMAT, header.point_format.num_extra_bytes)
     header.vlrs.append(LasZipVlr(vlr.record_data()))
@@ -63,7 +68,7 @@ def laz_parts(head: LazHead, tables: Iterable[Table]) -> Iterator[bytes]:
     yield sink.taken()
     compressor = lazrs.LasZipCompressor(sink, vlr)
     for table in tables:
-        rows = _rows(table, header.point_format.dtype(), head.node_edge_m)
+        rows = _rows(table, header.point_format.dtype(), head)
         compressor.compress_many(rows.view(np.uint8))
         yield sink.taken()
     compressor.done()
@@ -74,6 +79,7 @@ def _header(head: LazHead) -> Any:
     header = laspy.LasHeader(version="1.4", point_format=POINT_FORMAT)
     header.scales, header.offsets = np.full(3, head.node_edge_m / 2), np.zeros(3)
     header.add_extra_dims([laspy.ExtraBytesParams(name, np.dtype("<f4"), description=EXTRA[name]) for name in EXTRA])
+    header.add_extra_dims([laspy.ExtraBytesParams(name, np.dtype("<f8"), description=TIME) for name in head.times])
     header.vlrs.append(WktCoordinateSystemVlr(f'LOCAL_CS["{head.frame}",LOCAL_DATUM["local",32767],UNIT["metre",1]]'))
     header.global_encoding.wkt = True
     header.generating_software = "cairn"
@@ -84,14 +90,14 @@ def _header(head: LazHead) -> Any:
     return header
 
 
-def _rows(table: Table, dtype: np.dtype[np.void], node_edge_m: float) -> Table:
+def _rows(table: Table, dtype: np.dtype[np.void], head: LazHead) -> Table:
     rows = np.zeros(len(table), dtype)
     for name in "xyz":
         # Centres are odd numbers of half an edge: so single precision, which tables have, is enough.
-        rows[name.upper()] = 2 * np.floor(table[name].astype(np.float64) / node_edge_m).astype(np.int32) + 1
+        rows[name.upper()] = 2 * np.floor(table[name].astype(np.float64) / head.node_edge_m).astype(np.int32) + 1
     for name in ("red", "green", "blue"):
         rows[name] = table[name].astype(np.uint16) * COLOUR_STEP
-    for name in EXTRA:
+    for name in (*EXTRA, *head.times):
         rows[name] = table[name]
     rows["bit_fields"] = RETURN
     return rows

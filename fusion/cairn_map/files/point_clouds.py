@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_map.arrays import Floats
+from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey, Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
@@ -36,8 +37,13 @@ POINT = np.dtype(
     ]
 )
 """Centre of a node, metres, map frame; 8-bit sRGB, grey where no colour camera looked; kelvin, NaN where unknown."""
+TIMES = {"colour_measured_s": ChannelKind.COLOUR, "temperature_measured_s": ChannelKind.TEMPERATURE}
+"""Fields of a map with epochs, and channels whose newest samples below a node they date."""
+DATED_POINT = np.dtype([*POINT.descr, *((name, "<f8") for name in TIMES)])
+"""`POINT`, and first instants of epochs, UTC seconds since 1970; NaN where unknown."""
 PCD_POINT = np.dtype([(name, "<f4") for name in ("x", "y", "z", "rgb", "probability", "temperature", "hottest")])
 """Row of a PCD file: the Point Cloud Library stores colours as 0x00RRGGBB in the bits of a float."""
+DATED_PCD_POINT = np.dtype([*PCD_POINT.descr, *((name, "<f8") for name in TIMES)])
 NPZ_MEMBER = "points.npy"
 
 
@@ -62,9 +68,22 @@ class About:
 
     map_name: str
     node_edge_m: float
+    has_times: bool = False
+    """True of a map with epochs: the points have `TIMES`."""
 
     def __str__(self) -> str:
-        return f"map {self.map_name}, nodes of {self.node_edge_m:g} m; metres, map frame; kelvin"
+        times = "; UTC seconds since 1970" if self.has_times else ""
+        return f"map {self.map_name}, nodes of {self.node_edge_m:g} m; metres, map frame; kelvin{times}"
+
+    @property
+    def point(self) -> np.dtype[np.void]:
+        """Rows of the tables."""
+        return DATED_POINT if self.has_times else POINT
+
+    @property
+    def pcd_point(self) -> np.dtype[np.void]:
+        """Rows of a PCD file."""
+        return DATED_PCD_POINT if self.has_times else PCD_POINT
 
 
 def found_in_cell(
@@ -78,13 +97,14 @@ def found_in_cell(
 def points_of_cell(
     key: CellKey, evidence: Evidence, geometry: Geometry, model: SensorModel, asked: ExportRequest
 ) -> Table:
-    """(N,) of `POINT`: the selected occupied nodes of one cell, rising in Morton number.
+    """(N,) of `POINT`, or of a dated reading `DATED_POINT`: the selected occupied nodes of one cell, in Morton order.
 
     Raises:
         BadInputError: kind `bad_box`, `bad_style`.
     """
     chosen = chosen_in_cell(key, evidence, geometry, model, asked)
-    view, table = chosen.view, np.zeros(len(chosen.view), POINT)
+    view, measured_s = chosen.view, evidence.measured_s
+    table = np.zeros(len(view), POINT if measured_s is None else DATED_POINT)
     for axis, name in enumerate("xyz"):
         table[name] = chosen.centres_m[:, axis]
     for c, name in enumerate(("red", "green", "blue")):
@@ -94,18 +114,27 @@ def points_of_cell(
     table["temperature"] = table["hottest"] = np.nan
     table["temperature"][view.warm] = view.temperature_k[:, 0]
     table["hottest"][view.warm] = view.temperature_k[:, -1]
+    if measured_s is not None:
+        rows = view.rows_of(evidence.voxels[evidence.sampled] >> np.uint32(3 * (geometry.depth - view.depth)))
+        for name, kind in TIMES.items():
+            newest = np.full(len(view), np.nan)
+            for column in [n for n, channel in enumerate(geometry.channels) if channel.kind is kind][:1]:
+                np.fmax.at(newest, rows[rows >= 0], measured_s[rows >= 0, column])
+            table[name] = newest
     return table[chosen.rows]
 
 
 def point_file(form: str, found: PointBounds, tables: Iterable[Table], about: About) -> Iterator[bytes]:
     """Parts of a file of points: PLY, PCD (both binary), LAZ, or NPZ with one array `points`."""
     if form == "npz":
-        return _npz_parts(found.count, tables)
+        return _npz_parts(found.count, tables, about)
     if form == "laz":
         from cairn_map.files.laz import LazHead, laz_parts  # its libraries are a server's
 
         low_m, high_m = (found.low_m, found.high_m) if found.count else (np.zeros(3), np.zeros(3))
-        return laz_parts(LazHead(found.count, low_m, high_m, about.node_edge_m, f"map {about.map_name}"), tables)
+        names = tuple(TIMES) if about.has_times else ()
+        head = LazHead(found.count, low_m, high_m, about.node_edge_m, f"map {about.map_name}", names)
+        return laz_parts(head, tables)
     return _plain_parts(form, found.count, tables, about)
 
 
@@ -113,7 +142,7 @@ def size_of_file(form: str, found: PointBounds, about: About) -> int | None:
     """Size of a PLY or PCD file, bytes; None for NPZ and LAZ, whose size is unknown before they are made."""
     if form not in ("ply", "pcd"):
         return None
-    head, point = (_ply_head, POINT) if form == "ply" else (_pcd_head, PCD_POINT)
+    head, point = (_ply_head, about.point) if form == "ply" else (_pcd_head, about.pcd_point)
     return len(head(found.count, about)) + found.count * point.itemsize
 
 
@@ -128,19 +157,20 @@ def _plain(table: Table) -> bytes:
 
 
 def _ply_head(count: int, about: About) -> bytes:
-    words = {"f": "float", "u": "uchar"}
+    words = {"<f4": "float", "<f8": "double", "|u1": "uchar"}
     lines = ["ply", "format binary_little_endian 1.0", f"comment cairn; {about}", f"element vertex {count}"]
-    lines += [f"property {words[POINT[name].kind]} {name}" for name in POINT.names or ()]
+    lines += [f"property {words[about.point[name].str]} {name}" for name in about.point.names or ()]
     return "\n".join([*lines, "end_header", ""]).encode()
 
 
 def _pcd_head(count: int, about: About) -> bytes:
-    names = PCD_POINT.names or ()
+    point = about.pcd_point
+    names = point.names or ()
     lines = [
         f"# cairn; {about}",
         "VERSION 0.7",
         f"FIELDS {' '.join(names)}",
-        f"SIZE {' '.join('4' for _ in names)}",
+        f"SIZE {' '.join(str(point[name].itemsize) for name in names)}",
         f"TYPE {' '.join('F' for _ in names)}",
         f"COUNT {' '.join('1' for _ in names)}",
         f"WIDTH {count}",
@@ -154,17 +184,17 @@ def _pcd_head(count: int, about: About) -> bytes:
 
 
 def _pcd_rows(table: Table) -> bytes:
-    rows = np.empty(len(table), PCD_POINT)
-    for name in ("x", "y", "z", "probability", "temperature", "hottest"):
+    rows = np.empty(len(table), PCD_POINT if table.dtype == POINT else DATED_PCD_POINT)
+    for name in set(rows.dtype.names or ()) - {"rgb"}:
         rows[name] = table[name]
     red, green, blue = (table[name].astype(np.uint32) for name in ("red", "green", "blue"))
     rows["rgb"] = (red << 16 | green << 8 | blue).view(np.float32)
     return rows.tobytes()
 
 
-def _npz_parts(count: int, tables: Iterable[Table]) -> Iterator[bytes]:
+def _npz_parts(count: int, tables: Iterable[Table], about: About) -> Iterator[bytes]:
     sink = ForwardOnlyFile()
-    description = {"descr": np.lib.format.dtype_to_descr(POINT), "fortran_order": False, "shape": (count,)}
+    description = {"descr": np.lib.format.dtype_to_descr(about.point), "fortran_order": False, "shape": (count,)}
     with (
         zipfile.ZipFile(sink, "w", zipfile.ZIP_STORED) as archive,
         archive.open(NPZ_MEMBER, "w", force_zip64=True) as member,

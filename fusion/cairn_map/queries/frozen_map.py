@@ -42,7 +42,7 @@ class FreezableMap(Protocol):
         ...
 
     def frozen_times(self) -> VoxelTimes | None:
-        """Times at which voxels were seen last, unaffected by later changes of the map; None: it has no epochs."""
+        """Times of voxels and of their samples, unaffected by later changes of the map; None: it has no epochs."""
         ...
 
 
@@ -57,7 +57,7 @@ class FrozenMap:
     states: tuple[CellStates, ...]
     grid: Grid
     times: VoxelTimes | None = None
-    """Times at which voxels were seen; None: the map has no epochs."""
+    """Times of voxels and of their samples; None: the map has no epochs."""
 
     @property
     def reach_m(self) -> float:

@@ -15,7 +15,7 @@ map frame, sides may be infinite: it holds the voxels whose centres it holds; wi
 Lengths are metres, temperatures kelvin (apparent), colours sRGB 0 to 255. Evidence is read under the snapshot's
 `SensorModel`: probabilities are clamped, and a voxel without hits and misses is unknown. Of a map with epochs, what was
 seen later outweighs what was seen before, and colours and temperatures are the newest; `seen_at` has the time at which
-a voxel was seen last, perhaps by a camera without colour or temperature.
+a voxel was seen last, perhaps by a camera without colour or temperature, `measured_at` that of a colour or temperature.
 """
 
 from typing import Self
@@ -72,7 +72,7 @@ class MapSnapshot:
 
     @property
     def has_times(self) -> bool:
-        """True if the map has epochs, so that `seen_at` has answers."""
+        """True if the map has epochs, so that `seen_at` and `measured_at` have answers."""
         return self._frozen.times is not None
 
     def state_at(self, points_m: npt.ArrayLike) -> npt.NDArray[np.uint8]:
@@ -119,6 +119,17 @@ class MapSnapshot:
         NaN where it never was, where it was only without a time, and everywhere in a map without epochs.
         """
         return point_queries.seen_at(self._frozen, points_m)
+
+    def measured_at(self, points_m: npt.ArrayLike, channel: str) -> Floats:
+        """(N,) first instant of the epoch of the newest samples in `reading_at`, UTC seconds since 1970.
+
+        NaN where there are none, where these have no time, and everywhere in a map without epochs. Rows of the cells
+        around the points are decoded, some milliseconds each: ask for many points at once.
+
+        Raises:
+            BadInputError: kind `unknown_channel`: the map has no channel of that name.
+        """
+        return point_queries.measured_at(self._frozen, points_m, point_queries.channel_named(self._frozen, channel))
 
     def cast_rays(
         self, origins_m: npt.ArrayLike, directions: npt.ArrayLike, *, max_range_m: float, ends_in_unknown: bool = False

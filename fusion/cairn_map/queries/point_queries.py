@@ -89,8 +89,19 @@ def seen_at(frozen: FrozenMap, points_m: npt.ArrayLike) -> Floats:
     seen_s = np.full(len(points), np.nan)
     for part, slot, rows, places in _located(frozen, points):
         if frozen.times is not None:
-            seen_s[part][rows] = frozen.times(frozen.keys[slot], places[rows])
+            seen_s[part][rows] = frozen.times.seen(frozen.keys[slot], places[rows])
     return seen_s
+
+
+def measured_at(frozen: FrozenMap, points_m: npt.ArrayLike, channel: Channel) -> Floats:
+    """(N,) times, UTC seconds since 1970, of the newest samples of which `reading_at` is made; NaN where unknown."""
+    points, column = as_points(points_m, "points"), frozen.geometry.channels.index(channel)
+    measured_s = np.full(len(points), np.nan)
+    for part, slot, rows, places in _located(frozen, points):
+        if frozen.times is not None:
+            times = frozen.times.measured(frozen.keys[slot], places[rows], frozen.model)
+            measured_s[part][rows] = times[:, column]
+    return measured_s
 
 
 def channel_named(frozen: FrozenMap, name: str) -> Channel:

@@ -23,7 +23,6 @@ Side = Annotated[int, Field(ge=2, le=SIDE_MAX)]
 Level = Annotated[float, Field(gt=-1e9, lt=1e9)]
 TURN_TOLERANCE = 1e-3
 LOWER_CHARACTERS_MAX = 1000
-NO_AGE_THEN = "ages are counted from the newest measurement: leave out the time, or look at another layer"
 
 
 class RenderRequest(BaseModel):
@@ -74,8 +73,6 @@ class RenderRequest(BaseModel):
             raise ValueError(f"the scale must go from a low to a higher value, got {low} and {high}")
         if self.covariance_lower is not None and (self.sigma_m or self.sigma_rad):
             raise ValueError("give sigma_m and sigma_rad, or covariance_lower, not both")
-        if self.layer is Layer.AGE and self.at is not None:
-            raise ValueError(NO_AGE_THEN)
         _ = self.spread
         return self
 

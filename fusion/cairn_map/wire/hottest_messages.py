@@ -5,6 +5,7 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field
 
 from cairn_map.wire.messages import CursorText
+from cairn_map.wire.voxel_messages import MeasuredOrNone
 
 Triple = tuple[int, int, int]
 HOTTEST_MAX = 1000
@@ -37,6 +38,8 @@ class HotVoxel(_Model):
     """Standard deviation of the samples."""
     sigma: float
     """Standard uncertainty of one sample, the spread and the camera's own."""
+    measured_s: MeasuredOrNone = None
+    """First instant of the epoch of the newest samples, UTC seconds since 1970; None, and not in JSON: unknown."""
 
 
 class HottestAnswer(_Model):

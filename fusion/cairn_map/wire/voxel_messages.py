@@ -8,6 +8,8 @@ from cairn_map.evidence.channels import ChannelKind
 from cairn_map.wire.messages import CursorText, IdText
 
 Triple = tuple[int, int, int]
+MeasuredOrNone = Annotated[float | None, Field(exclude_if=lambda value: value is None)]
+"""Time of samples; a client of the release before does not know it, nor any map that has it."""
 
 
 class _Model(BaseModel):
@@ -26,6 +28,8 @@ class ChannelReading(_Model):
     """Mean in the unit, one number or three; empty without weight."""
     sigma: float | None
     """Standard uncertainty of one sample, the samples' spread and the camera's own; None but for temperatures."""
+    measured_s: MeasuredOrNone = None
+    """First instant of the epoch of the newest samples, UTC seconds since 1970; None, and not in JSON: unknown."""
 
 
 class VoxelCommit(_Model):

@@ -9,17 +9,18 @@ the cells left could have a hotter one.
 import time
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import product
 
 import numpy as np
 import numpy.typing as npt
 
+from cairn_map.arrays import Floats, Words32
 from cairn_map.evidence.brick_cell import BrickCell, brick_cell, reading_cell
 from cairn_map.evidence.channels import Channel, ChannelKind
-from cairn_map.evidence.grid import CELL_LIMIT, CellKey, Geometry, cell_key, cell_of_key, voxels_in_cell
+from cairn_map.evidence.grid import CELL_LIMIT, CellKey, Geometry, cell_key, cell_of_key, split_voxels, voxels_in_cell
 from cairn_map.evidence.inverse_sensor_model import SensorModel
-from cairn_map.evidence.voxels import Voxels
+from cairn_map.evidence.voxels import Voxels, measured_or_none
 from cairn_map.files.export_request import ExportRequest, cell_may_have
 from cairn_map.queries.frozen_map import freeze
 from cairn_map.queries.point_queries import first_of_kind
@@ -80,6 +81,22 @@ class _Part:
         """None."""
 
 
+@dataclass(frozen=True, slots=True)
+class _HotCell:
+    """Voxels of a cell that are occupied or have samples, and the times of these."""
+
+    bricks: BrickCell
+    sampled: Words32
+    """(S,) voxels that have samples, rising."""
+    measured_s: Floats | None
+    """(S, C) as in `Evidence`."""
+
+    @property
+    def size_bytes(self) -> int:
+        times = 0 if self.measured_s is None else self.measured_s.nbytes
+        return self.bricks.size_bytes + self.sampled.nbytes + times
+
+
 @dataclass(slots=True)
 class _Search:
     """One search under way."""
@@ -93,7 +110,7 @@ class _Search:
     faults: CellFaults
     channel: Channel
     """Channel of the temperatures."""
-    kept: OrderedDict[CellKey, BrickCell] = field(default_factory=OrderedDict)
+    kept: OrderedDict[CellKey, _HotCell] = field(default_factory=OrderedDict)
     """Cells that were decoded, those used last at the end."""
     kept_bytes: int = 0
     sure: list[HotVoxel] = field(default_factory=list)
@@ -126,7 +143,7 @@ class _Search:
         alone = self._with(key, self._ranked(key, cells))
         # A voxel at the border may touch a surface of the next cell: then it counts before all that are in doubt.
         sure = alone[0]
-        wanted = self._beyond_border(key, cells[key], sure[-1].mean if len(sure) == self.count else -np.inf)
+        wanted = self._beyond_border(key, cells[key].bricks, sure[-1].mean if len(sure) == self.count else -np.inf)
         size_bytes = cells[key].size_bytes
         for each in wanted:
             cell = self._cell(each)
@@ -138,12 +155,21 @@ class _Search:
         self.sure, self.doubtful = self._with(key, self._ranked(key, cells)) if wanted else alone
         return True
 
-    def _ranked(self, key: CellKey, cells: Mapping[CellKey, BrickCell]) -> tuple[Voxels, Bools]:
+    def _ranked(self, key: CellKey, cells: Mapping[CellKey, _HotCell]) -> tuple[Voxels, Bools]:
         """Hottest voxels of a cell, and which of them are confirmed by what these cells hold."""
-        part, (low, high) = _Part(self.row.geometry, cells), self.asked.bounds_m()
-        frozen = freeze(part, self.row.sensor_model)
-        box_m = np.stack([low, high])
-        return ranked_hottest(frozen, self.count, min_probability=OCCUPIED_FROM, box_m=box_m, only=key)
+        part = _Part(self.row.geometry, {each: cell.bricks for each, cell in cells.items()})
+        frozen, box_m = freeze(part, self.row.sensor_model), np.stack(self.asked.bounds_m())
+        voxels, are_sure = ranked_hottest(frozen, self.count, min_probability=OCCUPIED_FROM, box_m=box_m, only=key)
+        return self._dated(voxels, cells[key]), are_sure
+
+    def _dated(self, voxels: Voxels, cell: _HotCell) -> Voxels:
+        """Voxels of a cell with the times of their temperatures, where the map has epochs."""
+        if cell.measured_s is None:
+            return voxels
+        places = np.searchsorted(cell.sampled, split_voxels(voxels.numbers, self.row.geometry)[1])
+        measured_s = cell.measured_s[places, self.row.geometry.channels.index(self.channel)]
+        name = self.channel.name
+        return replace(voxels, readings={name: replace(voxels.readings[name], measured_s=measured_s)})
 
     def _with(self, key: CellKey, ranked: tuple[Voxels, Bools]) -> tuple[list[HotVoxel], list[HotVoxel]]:
         """The hottest confirmed voxels, and the others, of all cells so far and this one."""
@@ -169,7 +195,7 @@ class _Search:
         inside = ((i, j, k) for i, j, k in near if all(-CELL_LIMIT <= n < CELL_LIMIT for n in (i, j, k)))
         return [found for each in inside if (found := cell_key(each)) in self.listed]
 
-    def _cell(self, key: CellKey) -> BrickCell:
+    def _cell(self, key: CellKey) -> _HotCell:
         """Occupied voxels of a cell, and those with samples."""
         if key in self.kept:
             self.kept.move_to_end(key)
@@ -184,9 +210,10 @@ class _Search:
             keep[evidence.sampled] = True
             evidence = evidence.where(keep)
             if evidence.odds is None:
-                made = brick_cell(row.geometry, [evidence])
+                bricks = brick_cell(row.geometry, [evidence])
             else:
-                made = reading_cell(row.geometry, evidence, row.sensor_model)
+                bricks = reading_cell(row.geometry, evidence, row.sensor_model)
+            made = _HotCell(bricks, evidence.voxels[evidence.sampled], evidence.measured_s)
         self.kept[key] = made
         self.kept_bytes += made.size_bytes
         while self.kept_bytes > CELLS_BYTES and len(self.kept) > 1:
@@ -214,4 +241,5 @@ def _hot_voxels(voxels: Voxels, key: CellKey, *, confirmed: bool) -> Iterator[Ho
             weight=int(reading.weight[n]),
             spread=float(reading.spread[n]),
             sigma=float(reading.sigma[n]),
+            measured_s=measured_or_none(reading, n),
         )

@@ -139,7 +139,8 @@ class _PointFile:
     def __init__(self, row: MapRow, asked: ExportRequest) -> None:
         self.row, self.asked, self.until_s = row, asked, _until_s(asked)
         self._found = PointBounds()
-        self._about = About(row.name, node_geometry(row.geometry, asked).voxel_edge_m)
+        edge_m = node_geometry(row.geometry, asked).voxel_edge_m
+        self._about = About(row.name, edge_m, has_times=row.layer.has_epochs)
 
     def kept(self, key: CellKey, body: bytes, evidence: Evidence) -> bytes:
         """Bytes of a cell to be laid aside; empty if it has nothing that is asked for."""

@@ -38,7 +38,7 @@ from cairn_server.folding.single_flight import MadeOnce
 from cairn_server.store.stamps import Stamps, decode_stamps, no_stamps
 from cairn_server.store.store import Snapshot, Store
 from cairn_server.store.store_rows import CellRow, MapRow
-from cairn_server.views.readings import moment_name, past_reading, stored_reading
+from cairn_server.views.readings import moment_name, past_reading, past_times_s, stored_reading
 
 log = logging.getLogger(__name__)
 
@@ -162,7 +162,9 @@ class MapViews:
     def _body(self, task: _Task, places: Ints, request: RenderRequest) -> bytes:
         drawing, renderer = self._drawing(task, places, request)
         snapshot, seen = drawing.snapshot, drawing.seen
-        ages = self._ages(task, drawing) if request.layer is Layer.AGE else None
+        ages = None
+        if request.layer is Layer.AGE:
+            ages = self._ages(task, drawing) if task.until_s is None else _past_ages(task, drawing, task.until_s)
         values = layer_values(renderer, snapshot, seen, request.layer, ages)
         task.check_time()
         if request.format == "npz":
@@ -233,14 +235,11 @@ class MapViews:
         So the picture depends on the map alone. Where a commit states no time, or one was taken out since, the age is
         unknown.
         """
-        slots = np.unique(drawing.seen.slots[drawing.seen.hit]).tolist()
-        stamps = {key: self._stamps(task, key) for key in (drawing.snapshot.frozen.keys[slot] for slot in slots)}
+        stamps = {key: self._stamps(task, key) for key in _cells_seen(drawing)}
         entries = {int(seq) for each in stamps.values() for seq in np.unique(each)} - {0}
-        newest_s = task.snapshot.newest_captured_s() if task.until_s is None else task.until_s
+        newest_s = task.snapshot.newest_captured_s()
         times = {seq: self._time_of(task, seq) for seq in sorted(entries)}
         numbers, moments = np.array([0, *times]), np.array([np.nan, *times.values()])
-        # Of what changed since the time that is shown, the age then is unknown.
-        moments[moments > (np.inf if task.until_s is None else task.until_s)] = np.nan
         changes = {key: moments[np.searchsorted(numbers, each)] for key, each in stamps.items()}
         return Ages(changes, now=np.nan if newest_s is None else newest_s)
 
@@ -296,6 +295,25 @@ _loading = threading.Lock()
 def _read_of(layer: Layer) -> Layer:
     """The layer whose values are taken from cells' sums: of depths and ages, none, as for depths."""
     return Layer.DEPTH if layer is Layer.AGE else layer
+
+
+def _cells_seen(drawing: Drawing) -> list[CellKey]:
+    """Cells of which a pixel shows something."""
+    slots = np.unique(drawing.seen.slots[drawing.seen.hit]).tolist()
+    return [drawing.snapshot.frozen.keys[slot] for slot in slots]
+
+
+def _past_ages(task: _Task, drawing: Drawing, until_s: float) -> Ages:
+    """Times of the last measurement, until a time, of everything seen; now is that time."""
+    changes = {}
+    for key in _cells_seen(drawing):
+        task.check_time()
+        stored = sound_cell(task.snapshot, key, task.row.layer, task.healed)
+        if stored is None:
+            raise DamagedCellError(key, "a cell is listed, but is not there")
+        with DECODING.of_cell(task.row.geometry, stored.voxels):
+            changes[key] = past_times_s(task.snapshot, stored, task.row, until_s)
+    return Ages(changes, now=until_s)
 
 
 def _ready(stored: CellRow | None, task: _Task) -> ReadCell:

@@ -6,16 +6,20 @@
 What was taken out of a map is in no reading, whenever it was taken out.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import overload
 
+import numpy as np
+
+from cairn_map.arrays import Floats
 from cairn_map.codec.layer_code import encode_layer_cell, row_bodies
 from cairn_map.commits.cursor import ENTRY_FOLD
 from cairn_map.commits.ids import CommitId
 from cairn_map.epochs.cell_history import CellHistory, cell_history
-from cairn_map.epochs.epoch import BASE, Epoch, epoch_of
+from cairn_map.epochs.cell_reading import block_times_s
+from cairn_map.epochs.epoch import BASE, Epoch, begin_s, epoch_of
 from cairn_map.epochs.present import present_of_rows, shown_evidence
-from cairn_map.errors import BadInputError, ConflictError
+from cairn_map.errors import BadInputError, ConflictError, DamagedDataError
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey, cell_of_key
 from cairn_server.cell_room import DECODING, decoded_bytes, voxels_of
@@ -100,8 +104,8 @@ def _reading_by_row(key: CellKey, body: bytes, row: MapRow, until: Epoch | None)
     bodies = {
         epoch: each for epoch, each in row_bodies(body, key, row.layer).items() if until is None or epoch <= until
     }
-    rows = _RowsAtRest(key, list(bodies.values()))
-    return present_of_rows(list(bodies), rows, row.geometry, row.sensor_model).evidence
+    read = present_of_rows(list(bodies), _RowsAtRest(key, list(bodies.values())), row.geometry, row.sensor_model)
+    return read.evidence if row.epoch_s is None else read.dated_evidence(row.epoch_s)
 
 
 def past_reading(snapshot: Snapshot, stored: CellRow, row: MapRow, until_s: float) -> Evidence:
@@ -152,6 +156,39 @@ def past_rows(snapshot: Snapshot, stored: CellRow, row: MapRow, until_s: float) 
         return stored_history(stored, row.layer).until(epoch_of(until_s, row.epoch_s))
     until, _ = kept_contributions(snapshot, stored, row, until_s)
     return sum_of_contributions(snapshot, stored.key, until, row.layer).history()
+
+
+def past_times_s(snapshot: Snapshot, stored: CellRow, row: MapRow, until_s: float) -> Floats:
+    """Times of a stored cell's blocks as `block_times_s` has them, of what `past_reading` shows.
+
+    Of a map with epochs they are the first instants of epochs, else the last scans of commits.
+
+    Raises:
+        ConflictError, BadInputError, DamagedDataError: as `past_rows`.
+    """
+    if row.epoch_s is None:
+        until, _ = kept_contributions(snapshot, stored, row, until_s)
+        return block_times_s(_dated_diffs(snapshot, stored.key, until), row.geometry.depth)
+    check_stored(stored, row.layer)
+    last, epoch_s = epoch_of(until_s, row.epoch_s), row.epoch_s
+    dated = (
+        (begin_s(epoch, epoch_s), decode_stored(stored.key, body).evidence)
+        for epoch, body in row_bodies(stored.body, stored.key, row.layer).items()
+        if BASE < epoch <= last
+    )
+    return block_times_s(dated, row.geometry.depth)
+
+
+def _dated_diffs(
+    snapshot: Snapshot, key: CellKey, contributions: Iterable[Contribution]
+) -> Iterator[tuple[float, Evidence]]:
+    """Time of the last scan, NaN if it is not stated, and evidence of each commit of a cell."""
+    for entry in contributions:
+        (said,) = snapshot.log(after_seq=entry.seq - 1, limit=1)
+        body = snapshot.diff(entry.commit, key)
+        if body is None:
+            raise DamagedDataError("damaged_store", f"a diff of cell {cell_of_key(key)} is not there")
+        yield said.captured_s[1] if said.captured_s else np.nan, decode_stored(key, body).evidence
 
 
 def rows_around(snapshot: Snapshot, stored: CellRow, row: MapRow, since_s: float, until_s: float | None) -> CellHistory:

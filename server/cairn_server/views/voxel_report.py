@@ -15,7 +15,7 @@ from cairn_map.errors import BadInputError, NotFoundError
 from cairn_map.evidence.channels import Channel
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey, Geometry, cell_key, centres_of_voxels, split_voxels, voxels_of_points
-from cairn_map.evidence.voxels import Reading, voxels_of_evidence
+from cairn_map.evidence.voxels import Reading, measured_or_none, voxels_of_evidence
 from cairn_map.wire.messages import LogEntry
 from cairn_map.wire.voxel_messages import ChannelReading, VoxelAnswer, VoxelCommit
 from cairn_server.cell_room import DECODING, voxels_of
@@ -93,10 +93,9 @@ def _only(evidence: Evidence, place: int) -> Evidence:
     """Evidence of one voxel alone, empty if it has none."""
     at = int(np.searchsorted(evidence.voxels, place))
     rows = np.array([at]) if at < len(evidence) and evidence.voxels[at] == place else np.empty(0, np.int64)
-    mine = np.isin(evidence.sampled, rows)
-    sampled = np.zeros(int(mine.sum()), evidence.sampled.dtype)
-    odds = None if evidence.odds is None else evidence.odds[rows]
-    return Evidence(evidence.voxels[rows], evidence.counts[rows], sampled, evidence.samples[mine], odds)
+    keep = np.zeros(len(evidence), np.bool_)
+    keep[rows] = True
+    return evidence.where(keep)
 
 
 def _readings(readings: dict[str, Reading], geometry: Geometry) -> list[ChannelReading]:
@@ -112,6 +111,7 @@ def _reading(reading: Reading, channel: Channel) -> ChannelReading:
         weight=weight,
         mean=[float(value) for value in reading.mean.ravel()] if weight else [],
         sigma=float(reading.sigma[0]) if weight and reading.sigma is not None else None,
+        measured_s=measured_or_none(reading, 0) if weight else None,
     )
 
 

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -204,3 +205,21 @@ def test_points_of_a_map_with_epochs_say_when_they_were_seen(
     assert [it["seen_s"] for it in found] == [1.8e9, None]
     lines = asked(capsys, "lab", "points", point, unknown).splitlines()
     assert [line.split()[-1] for line in lines] == ["seen", "2027-01-15T08:00Z", "-"]
+
+
+def test_readings_of_a_map_with_epochs_say_how_often_and_when_they_were_measured(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = HistoryMap(MapLayer(geometry=GEOMETRY, epoch_s=600))
+    whole.merge({A: evidence()}, epoch=Epoch(3_000_000))
+    without = replace(evidence(), sampled=np.empty(0, np.uint32), samples=np.empty((0, 3), np.int64))
+    whole.merge({A: without}, epoch=Epoch(3_000_006))
+    monkeypatch.setattr(query, "open_map", lambda *_, **__: snapshot_of(whole))
+    (found,) = answered(capsys, "lab", "points", "0.06,0.06,0.06")
+    assert found["seen_s"] == 1.8e9 + 3600
+    warm = found["readings"]["temperature"]
+    assert (warm["weight"], warm["measured_s"]) == (2, 1.8e9)
+    shown = "(2 of 2027-01-15T08:00Z)"
+    assert shown in asked(capsys, "lab", "points", "0.06,0.06,0.06")
+    assert shown in asked(capsys, "lab", "hottest")
+    assert answered(capsys, "lab", "hottest")[0]["measured_s"] == 1.8e9

@@ -3,16 +3,20 @@
 import random
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from tests.fixtures.map.histories import change, epoch_map, random_history
 from tests.fixtures.map.made import KEY, SMALL, random_evidence
 
-from cairn_map.epochs.cell_history import NOTHING
+from cairn_map.codec.layer_code import encode_layer_cell, row_bodies
+from cairn_map.epochs import cell_reading
+from cairn_map.epochs.cell_history import NOTHING, cell_history
+from cairn_map.epochs.cell_history import merged as sum_of_histories
 from cairn_map.epochs.epoch import BASE, Epoch
 from cairn_map.epochs.history_map import HistoryMap
 from cairn_map.epochs.layer import MapLayer
-from cairn_map.epochs.map_reading import CompactReading, MapReading
+from cairn_map.epochs.map_reading import BlockTimes, CompactReading, MapReading
 from cairn_map.epochs.present import present
 from cairn_map.evidence.brick_cell import reading_cell
 from cairn_map.evidence.compact_cell import sums_of
@@ -84,17 +88,34 @@ def test_another_sensor_model_reads_all_cells_again() -> None:
 def test_times_are_those_of_the_moment_of_freezing() -> None:
     rows = two_cells()
     reading = MapReading(rows)
-    seen = reading.frozen_times()
-    assert seen is not None
+    times = reading.frozen_times()
+    assert times is not None
     places = np.arange(8**SMALL.depth, dtype=np.uint32)
-    before = seen(KEY, places)
+    before, measured = times.seen(KEY, places), times.measured(KEY, places, MODEL)
     add(rows, reading, 9, 99)
-    assert np.array_equal(seen(KEY, places), before, equal_nan=True)
-    assert np.nanmax(before) == 2 * 120
+    assert np.array_equal(times.seen(KEY, places), before, equal_nan=True)
+    assert np.array_equal(times.measured(KEY, places, MODEL), measured, equal_nan=True)
+    assert np.nanmax(before) == np.nanmax(measured) == 2 * 120
     then, until = reading.frozen_times(), MapReading(rows, at=Epoch(1)).frozen_times()
     assert then is not None and until is not None
-    assert np.nanmax(then(KEY, places)) == 9 * 120
-    assert np.nanmax(until(KEY, places)) == 120
+    assert np.nanmax(then.seen(KEY, places)) == np.nanmax(then.measured(KEY, places, MODEL)) == 9 * 120
+    assert np.nanmax(until.seen(KEY, places)) == np.nanmax(until.measured(KEY, places, MODEL)) == 120
+
+
+@given(st.integers(0, 10**6), st.sampled_from([None, BASE, Epoch(1), Epoch(8)]))
+def test_a_block_has_the_time_of_the_newest_evidence_in_it(seed: int, at: Epoch | None) -> None:
+    rows, history = epoch_map(), random_history(seed)
+    for epoch, row in history.rows.items():
+        change(rows, epoch, row)
+    times, expected = BlockTimes(rows, at=at), {}
+    for epoch in sorted(history):
+        if epoch != BASE and (at is None or epoch <= at):
+            expected |= dict.fromkeys((history.rows[epoch].voxels >> np.uint32(6)).tolist(), epoch * 120.0)
+    change(rows, Epoch(99), random_evidence(seed, SMALL))
+    assert list(times) == [KEY]
+    found = times[KEY]
+    assert len(found) == 8 ** (SMALL.depth - 2)
+    assert {block: time_s for block, time_s in enumerate(found.tolist()) if time_s == time_s} == expected
 
 
 def test_a_cell_of_few_bytes_is_not_held_as_a_reading() -> None:
@@ -121,6 +142,30 @@ def test_a_cell_of_few_bytes_is_not_held_as_a_reading() -> None:
     assert reading.frozen_cells(MODEL)[KEY].packed().counts.sum() == 2 * len(places) + 2
 
 
+def come(rows: HistoryMap, epoch: Epoch, seed: int) -> None:
+    """The cell comes again from a server, with more in one row."""
+    grown = sum_of_histories([rows.history(KEY), cell_history({epoch: random_evidence(seed, SMALL, voxels=20)})], SMALL)
+    data = encode_layer_cell(KEY, grown, rows.layer).data
+    rows.replace(KEY, grown, bodies=row_bodies(data, KEY, rows.layer), came_bytes=len(data))
+
+
+def test_a_cell_that_grows_at_its_newest_row_is_not_read_from_all_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = epoch_map()
+    change(rows, Epoch(0), random_evidence(0, SMALL))
+    for epoch in (1, 1, 2, 3):
+        come(rows, Epoch(epoch), epoch)
+    rows.frozen_cells(MODEL)
+    old = rows.rows(KEY)
+    with monkeypatch.context() as patch:
+        patch.setattr(cell_reading, "present", None)  # who reads all rows now fails
+        for epoch in (3, 3, 4):
+            come(rows, Epoch(epoch), 10 + epoch)
+            rows.frozen_cells(MODEL)
+    assert all(rows.rows(KEY)[epoch] is old[epoch] for epoch in (Epoch(0), Epoch(1), Epoch(2)))
+    found, fresh = rows.frozen_cells(MODEL)[KEY], MapReading(rows.copy()).frozen_cells(MODEL)[KEY]
+    assert found.packed() == fresh.packed()
+
+
 @given(st.integers(0, 10**6))
 def test_a_map_reads_as_one_made_afresh_whatever_was_done_to_it(seed: int) -> None:
     rng, rows = random.Random(seed), epoch_map()
@@ -133,7 +178,9 @@ def test_a_map_reads_as_one_made_afresh_whatever_was_done_to_it(seed: int) -> No
         elif merged and kind < 0.3:
             rows.replace(KEY, random_history(rng.randrange(10**6)))
             merged = []
-        elif kind < 0.32:
+        elif kind < 0.5 and KEY in rows:
+            come(rows, rng.choice([Epoch(n), max(rows.history(KEY), default=BASE)]), rng.randrange(10**6))
+        elif 0.5 <= kind < 0.52:
             rows.clear()
             merged = []
         else:

@@ -18,6 +18,7 @@ from cairn_map.epochs.cell_history import CellHistory, cell_history
 from cairn_map.epochs.epoch import BASE, Epoch
 from cairn_map.epochs.map_reading import MapReading
 from cairn_map.epochs.present import present
+from cairn_map.errors import BadInputError
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.grid import CellKey, cell_key, cell_of_key, centres_of_voxels, voxels_in_cell
@@ -114,6 +115,28 @@ def test_each_point_of_a_snapshot_reads_as_the_twin_says(seed: int, model: Senso
         np.where((packed.counts != 0).any(axis=1), packed.log_odds(model), np.nan),
         rtol=1e-12,
     )
+
+
+@given(st.integers(0, 10**6), MODELS, st.sampled_from([None, Epoch(3)]))
+def test_each_reading_has_the_time_of_the_newest_samples_that_it_shows(
+    seed: int, model: SensorModel, at: Epoch | None
+) -> None:
+    history, rows = random_history(seed), epoch_map()
+    for epoch, row in history.rows.items():
+        change(rows, epoch, row)
+    snapshot, reading = snapshot_of(MapReading(rows, at=at), model), present(history, SMALL, model, at=at)
+    points = centres_of_voxels(voxels_in_cell(np.arange(8**SMALL.depth, dtype=np.uint32), KEY, SMALL), SMALL)
+    for column, channel in enumerate(SMALL.channels):
+        expected = np.full(len(points), np.nan)
+        epochs = reading.sampled_in[:, column]
+        dated = epochs != BASE
+        expected[reading.voxels[reading.sampled[dated]]] = epochs[dated] * 120.0
+        found = snapshot.measured_at(points[::-1], channel.name)[::-1]
+        np.testing.assert_array_equal(found, expected)
+        # Whatever has a time has samples, and the files of the cell say the same.
+        assert (snapshot.reading_at(points, channel.name).weight[np.isfinite(found)] > 0).all()
+        voxels = voxels_of_evidence(KEY, reading.dated_evidence(120), SMALL, model, occupied_only=False)
+        np.testing.assert_array_equal(voxels.readings[channel.name].measured_s, expected[places_of(voxels)])
 
 
 def one_row(epoch: Epoch, cells: EvidenceMap) -> MapReading:
@@ -255,6 +278,32 @@ def test_a_snapshot_follows_the_rows_and_reads_only_cells_that_changed() -> None
     ) == 1
 
 
+def test_a_temperature_is_as_old_as_its_samples_and_not_as_its_voxel() -> None:
+    rows, place = epoch_map(), np.zeros(1, np.uint32)
+    samples = np.zeros((1, SMALL.plane_count), np.int64)
+    samples[0, SMALL.planes_of("temperature")] = [6000 * 4, 6000**2 * 4, 4]
+    hit = np.array([[5, 0]], np.int32)
+    change(rows, Epoch(3), Evidence(place, hit, place, samples))
+    change(rows, Epoch(8), Evidence(place, hit, np.empty(0, np.uint32), samples[:0]))
+    snapshot, point = snapshot_of(rows), centres_of_voxels(voxels_in_cell(place, KEY, SMALL), SMALL)
+    assert snapshot.seen_at(point).tolist() == [8 * 120]
+    assert snapshot.measured_at(point, "temperature").tolist() == [3 * 120]
+    assert np.isnan(snapshot.measured_at(point, "colour")).all()
+    with pytest.raises(BadInputError, match="smell"):
+        snapshot.measured_at(point, "smell")
+
+
+def test_files_say_when_samples_were_measured_in_maps_with_epochs_alone() -> None:
+    history = random_history(5)
+    sums, reading = history.total(SMALL), present(history, SMALL, MODEL)
+    for suffix, name in (("npz", b"temperature_measured_s"), ("ply", b"property double temperature_measured_s")):
+        files = [
+            cell_file(suffix, KEY, it, SMALL, MODEL)[0] for it in (sums, reading.evidence, reading.dated_evidence(9))
+        ]
+        assert [name in file for file in files] == [False, False, True]
+
+
 def test_a_map_without_epochs_has_no_times() -> None:
     snapshot = snapshot_of(random_map(1, SMALL))
     assert np.isnan(snapshot.seen_at(np.zeros((2, 3)))).all()
+    assert np.isnan(snapshot.measured_at(np.zeros((2, 3)), "temperature")).all()

@@ -75,6 +75,8 @@ def test_the_hottest_are_those_of_the_whole_map(live: Live, epoch_s: int | None)
         points = np.array([v.point_m for v in found.voxels])
         np.testing.assert_array_equal(whole.temperature_at(points).mean, [v.mean for v in found.voxels])
         np.testing.assert_array_equal(whole.counts_at(points), [(v.hits, v.misses) for v in found.voxels])
+        measured_s = [np.nan if v.measured_s is None else v.measured_s for v in found.voxels]
+        np.testing.assert_array_equal(whole.measured_at(points, "temperature"), measured_s)
         assert all(v.celsius == pytest.approx(v.mean - 273.15, abs=0.01) for v in found.voxels)
 
 

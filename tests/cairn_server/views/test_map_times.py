@@ -4,6 +4,7 @@ import io
 from collections.abc import Sequence
 
 import httpx
+import laspy
 import numpy as np
 import pytest
 from tests.fixtures.map.changing import CRATE, GEOMETRY, MODEL, WALL, Cells, scans
@@ -22,6 +23,7 @@ from cairn_map.epochs.layer import MapLayer
 from cairn_map.epochs.present import shown_evidence
 from cairn_map.evidence.grid import CellKey, cell_of_key, centres_of_voxels
 from cairn_map.evidence.view import evidence_of_view
+from cairn_map.files.point_clouds import DATED_PCD_POINT, POINT
 from cairn_map.wire.change_messages import CellVoxels, ChangesAnswer
 from cairn_server.folding.cells_at_rest import stored_history
 from cairn_server.store.store_rows import MapRow
@@ -227,3 +229,56 @@ def test_a_cell_with_more_rows_than_fit_in_memory_is_read_row_by_row_to_the_same
             again = [readings.reading_of_body(cell.key, cell.body, row) for cell in cells]
             found.append([now, then, again])
     assert found[0] == found[1]
+
+
+def test_temperatures_say_when_they_were_measured_and_how_often(live: Live) -> None:
+    row, plain = map_of(live, DOOR), map_of(live, DOOR, epoch_s=None)
+    path = f"voxels/{','.join(map(str, CRATE[0].tolist()))}"
+    (found,), (bare,) = (get(live, each, path).json()["channels"] for each in (row, plain))
+    assert (found["weight"], found["measured_s"], "measured_s" in bare) == (3, 900.0, False)
+    (never,) = get(live, row, f"voxels/{','.join(map(str, PILLAR[0].tolist()))}").json()["channels"]
+    assert (never["weight"], "measured_s" in never) == (0, False)
+    (hot,) = get(live, row, "hottest", count=1).json()["voxels"]
+    assert (hot["weight"], hot["measured_s"]) == (3, 900.0)
+    assert "measured_s" not in get(live, plain, "hottest", count=1).json()["voxels"][0]
+
+
+@pytest.mark.parametrize("depth", [GEOMETRY.depth, 1])
+def test_exported_points_say_when_their_temperatures_were_measured(live: Live, depth: int) -> None:
+    row, plain = map_of(live, DOOR), map_of(live, DOOR, epoch_s=None)
+    asked = {"format": "npz", "depth": depth}
+    with np.load(io.BytesIO(get(live, row, "export", **asked).content)) as arrays:
+        points = arrays["points"]
+    is_warm = np.isfinite(points["temperature"])
+    assert is_warm.any() and not is_warm.all()
+    assert set(points["temperature_measured_s"][is_warm].tolist()) == {900.0}
+    assert np.isnan(points["temperature_measured_s"][~is_warm]).all() and np.isnan(points["colour_measured_s"]).all()
+    with np.load(io.BytesIO(get(live, plain, "export", **asked).content)) as arrays:
+        assert arrays["points"].dtype == POINT
+    ply, pcd, laz = (get(live, row, "export", **(asked | {"format": form})) for form in ("ply", "pcd", "laz"))
+    head, _, body = ply.content.partition(b"end_header\n")
+    assert b"property double temperature_measured_s\n" in head and body == points.tobytes()
+    head, _, body = pcd.content.partition(b"DATA binary\n")
+    rows = np.frombuffer(body, DATED_PCD_POINT)
+    assert b"SIZE 4 4 4 4 4 4 4 8 8\n" in head
+    for form in (ply, pcd):
+        assert int(form.headers["Content-Length"]) == len(form.content)
+    with laspy.open(io.BytesIO(laz.content)) as file:
+        found = file.read()
+    for each in (rows, found):
+        np.testing.assert_array_equal(each["temperature_measured_s"], points["temperature_measured_s"])
+
+
+@pytest.mark.parametrize("epoch_s", [100, None])
+def test_ages_at_a_time_are_those_of_what_was_measured_until_then(live: Live, epoch_s: int | None) -> None:
+    row = map_of(live, DOOR, epoch_s)
+    look = {"x": 0.3, "y": -2, "z": 0.3, "qx": -0.70710678, "qw": 0.70710678, "width": 16, "height": 16, "focal_px": 8}
+    look |= {"layer": "age", "format": "npz"}
+    # Wall and place of the crate were seen in epoch 1, or until 150 s, the crate until 450 s.
+    for at_s, ages in ((199.0, {99.0, 49.0}), (499.0, {399.0, 349.0, 99.0, 49.0})):
+        with np.load(io.BytesIO(get(live, row, "render", at=at_s, **look).content)) as arrays:
+            found, range_m = arrays["age_s"], arrays["range_m"]
+        expected = ages & ({99.0, 399.0} if epoch_s else {49.0, 349.0})
+        assert np.isfinite(range_m).any()
+        assert set(found[np.isfinite(range_m)].tolist()) <= expected
+        assert set(found[np.isfinite(range_m)].tolist()) & {399.0, 349.0, 99.0, 49.0}

@@ -16,7 +16,8 @@ A map is a URL, or a folder: one of `cairn map export --cells`, a clone, or the 
 running. Of a URL those cells are downloaded that points, rays and nearest voxels need, and all for `slice`, `height`
 and --at with `hottest`; else the server itself finds the hottest. All lengths are metres in the map's frame,
 temperatures degrees Celsius here and kelvin in JSON; unknown values are `-`, in JSON null. Of a map with epochs, points
-have the time at which they were seen last, too: the beginning of its newest epoch, UTC.
+have the time at which they were seen last, too, and readings the count of their samples and the time of the newest: the
+beginning of its epoch, UTC.
 --json prints JSON for programs; `slice` and `height` then give all pixels, rows along y and columns along x.
 """
 
@@ -24,6 +25,7 @@ import argparse
 import json
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
 
@@ -34,6 +36,7 @@ from cairn_client.cli.arguments import Subparsers, add_at, add_token, api_of, sa
 from cairn_client.cli.robot_arguments import box, place
 from cairn_client.folders.map_folder import open_map, open_part
 from cairn_client.folders.needed_cells import Needs, along_ray, near_points
+from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.voxels import Reading
@@ -43,6 +46,7 @@ from cairn_map.queries.region_queries import MapImage
 from cairn_map.wire.hottest_messages import HOTTEST_MAX
 
 ZERO_CELSIUS_K = 273.15
+DATED_WIDTH = len("300.0 C +- 10.0 (1000 of 2026-01-31T12:00Z)")
 WIDTH = 100
 """Widest slice on a terminal, in characters."""
 SURENESS = f"{'probability':>12}{'hits':>6}{'misses':>7}"
@@ -135,8 +139,10 @@ def _points(snapshot: MapSnapshot, args: argparse.Namespace) -> tuple[Any, list[
     points = np.array(args.points)
     states, probability = snapshot.state_at(points), snapshot.probability_at(points)
     counts = snapshot.counts_at(points).tolist()
-    readings = {c.name: snapshot.reading_at(points, c.name) for c in snapshot.geometry.channels}
-    widths = {name: max(14, len(name)) for name in readings}
+    readings = {
+        c.name: _dated(snapshot, points, snapshot.reading_at(points, c.name)) for c in snapshot.geometry.channels
+    }
+    widths = {name: max(DATED_WIDTH if snapshot.has_times else 14, len(name)) for name in readings}
     # A map with epochs says when each voxel was seen last.
     seen_s = snapshot.seen_at(points).tolist() if snapshot.has_times else None
     widths |= {"seen": len("2026-01-31T12:00Z")} if seen_s else {}
@@ -183,9 +189,10 @@ def _nearest(snapshot: MapSnapshot, args: argparse.Namespace) -> tuple[Any, list
 def _hottest(snapshot: MapSnapshot, args: argparse.Namespace) -> tuple[Any, list[str]]:
     voxels = snapshot.hottest(args.count, box_m=_corners(args))
     reading = voxels.of_kind(ChannelKind.TEMPERATURE)
+    assert reading is not None  # noqa: S101 - or the snapshot had refused
+    reading = _dated(snapshot, voxels.centres_m, reading)
     found, lines = [], [HOTTEST_HEAD]
     for n, (x, y, z) in enumerate(voxels.centres_m.tolist()):
-        assert reading is not None  # noqa: S101 - or the snapshot had refused
         p, (hits, misses) = float(voxels.probability[n]), voxels.counts[n].tolist()
         sure = {"probability": p, "hits": hits, "misses": misses}
         found.append({"point_m": [x, y, z], **sure, **(_value(reading, n) or {})})
@@ -204,7 +211,8 @@ def _hottest_of_server(args: argparse.Namespace) -> tuple[Any, list[str]]:
     for voxel in answer.voxels:
         x, y, z = voxel.point_m
         text = f"{x:8.3f}{y:8.3f}{z:8.3f}  {_sureness(voxel.probability, voxel.hits, voxel.misses)}"
-        lines.append(f"{text}  {_shown_kelvin(voxel.mean, voxel.sigma)}")
+        whence = "" if voxel.measured_s is None else _whence(voxel.weight, voxel.measured_s)
+        lines.append(f"{text}  {_shown_kelvin(voxel.mean, voxel.sigma)}{whence}")
     lines = lines if answer.voxels else [NOTHING_HOT]
     if not answer.complete:
         lines.append("(the server's search ended at its bounds, there may be hotter places: ask for a --box)")
@@ -247,6 +255,7 @@ def _value(reading: Reading, n: int) -> dict[str, Any] | None:
     if not reading.weight[n]:
         return None
     value = {"mean": reading.mean[n].tolist(), "unit": reading.channel.unit, "weight": int(reading.weight[n])}
+    value |= {} if reading.measured_s is None else {"measured_s": _or_none(reading.measured_s[n])}
     if reading.spread is None or reading.sigma is None:
         return value
     return value | {"spread": float(reading.spread[n]), "sigma": float(reading.sigma[n])}
@@ -256,9 +265,25 @@ def _shown_kelvin(mean: float, sigma: float) -> str:
     return f"{mean - ZERO_CELSIUS_K:.1f} C +- {sigma:.1f}"
 
 
+def _dated(snapshot: MapSnapshot, points_m: Floats, reading: Reading) -> Reading:
+    """The reading at (N, 3) points, in a map with epochs with the times of its samples."""
+    measured_s = snapshot.measured_at(points_m, reading.channel.name) if snapshot.has_times else None
+    return replace(reading, measured_s=measured_s)
+
+
 def _shown(reading: Reading, n: int) -> str:
     if not reading.weight[n]:
         return "-"
+    measured_s = reading.measured_s
+    return _shown_mean(reading, n) + ("" if measured_s is None else _whence(int(reading.weight[n]), measured_s[n]))
+
+
+def _whence(samples: int, measured_s: float) -> str:
+    """Count of a reading's samples, and time of the newest."""
+    return f" ({samples} of {_minute(measured_s)})" if math.isfinite(measured_s) else f" ({samples})"
+
+
+def _shown_mean(reading: Reading, n: int) -> str:
     mean = reading.mean[n]
     if reading.channel.kind is ChannelKind.COLOUR:
         return "({:.0f} {:.0f} {:.0f})".format(*mean)

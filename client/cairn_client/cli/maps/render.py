@@ -38,7 +38,7 @@ from cairn_map.errors import BadInputError
 from cairn_map.render.map_picture import arrays_of, layer_picture, layer_values, npz_of
 from cairn_map.render.map_render import MapRenderer
 from cairn_map.render.render_picture import SCALES, Layer, Scale, png_of
-from cairn_map.render.render_request import NO_AGE_THEN, RenderRequest, request_from
+from cairn_map.render.render_request import RenderRequest, request_from
 
 THREADS = 2
 
@@ -111,14 +111,12 @@ def _check_no_source(args: argparse.Namespace) -> None:
 
 def _folder_map(args: argparse.Namespace) -> FolderMap:
     """The map here; with an age, if that is asked for."""
-    if args.layer is Layer.AGE and args.at is not None:
-        raise BadInputError("bad_option", f"--layer age: {NO_AGE_THEN}")
     found = map_of_folder(Path(args.map), at_s=seconds_of(args.at))
     if args.layer is Layer.AGE and found.ages is None:
         raise BadInputError(
             "no_age",
-            f"{args.map} does not say when anything was measured: exported cells never do, and a robot's state only of "
-            "commits of its own that it still keeps; give the map's URL, whose server knows",
+            f"{args.map} does not say when anything was measured: without epochs, exported cells never do, and a "
+            "robot's state only of commits of its own that it still keeps; give the map's URL, whose server knows",
         )
     return found
 

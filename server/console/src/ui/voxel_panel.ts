@@ -14,6 +14,8 @@ export interface ChannelReading {
   weight: number;
   mean: number[];
   sigma: number | null;
+  /** Time of the newest samples, in seconds; left out: unknown. */
+  measured_s?: number;
 }
 
 /** Answer to GET .../main/voxels/{voxel}. */
@@ -96,12 +98,14 @@ function exact(answer: VoxelAnswer): HTMLElement {
     ["centre", answer.centre_m.map((value) => value.toFixed(3)).join(", ") + " m"],
     ["probability", answer.probability === null ? "unknown" : answer.probability.toFixed(4)],
     ["seen", `${answer.hits} of ${seen} scans hit it`],
-    ...answer.channels.map(({ name, kind, unit, mean, sigma, weight }): [string, Node | string] => {
+    ...answer.channels.map(({ name, kind, unit, mean, sigma, weight, measured_s }): [string, Node | string] => {
       if (!weight) return [name, "none measured"];
-      if (kind === "colour") return [name, h("span", {}, swatch(mean), ` ${mean.map((value) => value.toFixed(1)).join(", ")} (${counted(weight, "sample", "samples")})`)];
+      const when = measured_s === undefined ? "" : `, ${clock(measured_s)}, ${ago(serverNowS() - measured_s)}`;
+      const whence = `(${counted(weight, "sample", "samples")}${when})`;
+      if (kind === "colour") return [name, h("span", {}, swatch(mean), ` ${mean.map((value) => value.toFixed(1)).join(", ")} ${whence}`)];
       const spread = sigma === null ? "" : ` ± ${sigma.toFixed(2)} ${unit === "K" ? "°C" : unit}`;
       const value = unit === "K" ? celsius(mean[0], 2) : `${mean[0].toFixed(2)} ${unit}`;
-      return [name, `${value}${spread} (${counted(weight, "sample", "samples")})`];
+      return [name, `${value}${spread} ${whence}`];
     }),
   ]);
 }
