@@ -4,6 +4,7 @@
     shelf: 15 scans; the first has 26% of its pixels, median range 0.57 m
     replayed 15 scans as 15 commits in 1.9 s (7.9 scans/s), 302.0 kB up, 62.8 kB down, 0 commits wait
     $ cairn robot run spool/ --map http://127.0.0.1:8750/maps/shelf --name mole
+    $ cairn robot live ws://robot:8765 --map http://127.0.0.1:8750/maps/shelf --name mole
     $ cairn robot status cairn-shelf/
     $ cairn robot queue cairn-shelf/
     $ cairn robot sync cairn-shelf/
@@ -27,7 +28,8 @@ cells that share more than a face with this box; and in short replies: with --re
 commits that take more work and four tenths fewer bytes, and sends them in parts of 16 kB, so that a link that breaks
 goes on where it stopped. On every link the cells around the robot come first.
 
-`run` maps the recordings that a driver puts into a folder, and syncs, until a signal ends it. `status` and `queue` look
+`run` maps the recordings that a driver puts into a folder, and syncs, until a signal ends it. `live` maps what a robot
+with ROS sees, through its Foxglove bridge, as it sees it. `status` and `queue` look
 into a robot's folder, also while the robot is at work. `amend` moves past measurements to the poses of a
 trajectory that a SLAM corrected.
 """
@@ -38,7 +40,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from cairn_client.cli.arguments import Subparsers, run_subcommand, say, shown_age, shown_bytes
-from cairn_client.cli.robots import amend, inspect, replay, run, sync
+from cairn_client.cli.robots import amend, inspect, live, replay, run, sync
 from cairn_client.folders.folder_status import FolderStatus, QueuedCommit, folder_queue, folder_status
 from cairn_map.errors import BadInputError
 
@@ -80,6 +82,7 @@ def main(argv: list[str]) -> int:
         replay.add_parser,
         inspect.add_parser,
         run.add_parser,
+        live.add_parser,
         *looking,
         sync.add_parser,
         amend.add_parser,
