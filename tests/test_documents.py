@@ -18,6 +18,7 @@ PAGES_WITH_COMMANDS = {
     "administrator.md",
     "calibration-engineer.md",
     "calibration-tour.md",
+    "live-robots.md",
     "operator.md",
     "paper-experiment.md",
     "robot-developer.md",

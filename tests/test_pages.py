@@ -19,6 +19,7 @@ import pytest
 from tests.fixtures.calib.foreign_rigs import ROS2_ECHO
 from tests.fixtures.calib.thermal_images import SIZE, black_bodies
 from tests.fixtures.client.live_server import wait_until
+from tests.fixtures.client.robot_program import scan_of
 from tests.fixtures.client.robots import robot_in
 from tests.fixtures.commands import cairn, record_room, served
 from tests.fixtures.fusion import cloud_forms
@@ -30,6 +31,7 @@ from tests.fixtures.sim.drive import record_drive
 
 from cairn_calib.rig.camera import camera_from_field_of_view
 from cairn_calib.rig.rig import Rig, Spectrum, mount_camera
+from cairn_fusion.recording.trajectory import trajectory_line
 from cairn_map.errors import DeniedError
 from cairn_map.evidence.grid import Geometry
 from cairn_sim.robots.heads import full_head
@@ -215,6 +217,18 @@ def write_clouds(folder: Path) -> None:
     kitti(folder, poses)
 
 
+def amend_a_walk(folder: Path, command: list[str]) -> None:
+    """Amend a robot's measurement by a trajectory that is 1 m farther along x."""
+    with robot_in(folder, name="state", keep_scans_bytes=1_000_000, stay=True) as robot:
+        scan = scan_of(1)
+        robot.observe(scan)
+        robot.commit()
+    T_map_rig = scan.T_map_rig.copy()
+    T_map_rig[0, 3] += 1.0
+    (folder / "optimised.tum").write_text(trajectory_line(scan.time_s, T_map_rig))
+    assert "1 measurement of state amended, by up to 1.00 m" in cairn(*command, folder=folder)
+
+
 def test_commands_of_the_page_for_robot_developers_run(page: Page) -> None:
     record_room(page.folder / "RECORDING")
     shutil.copytree(page.folder / "RECORDING", page.folder / "SPOOL" / "one")
@@ -225,7 +239,11 @@ def test_commands_of_the_page_for_robot_developers_run(page: Page) -> None:
     write_bag(page.folder / "bag", "mcap", lambda make: recorded(room, make)).rename(page.folder / "lab.mcap")
     page.serve("127.0.0.1", "--data", "server")
     run = "robot run SPOOL --map http://127.0.0.1:8750/maps/lab --name mole"
-    instead = {run: lambda: run_robot_until_pushed(page, *run.split())}
+    amend = "robot amend state/ --trajectory optimised.tum"
+    instead = {
+        run: lambda: run_robot_until_pushed(page, *run.split()),
+        amend: lambda: amend_a_walk(page.folder, amend.split()),
+    }
     replay = "robot replay lab.mcap --topics lab.yaml --map http://127.0.0.1:8750/maps/lab --voxel 0.04"
     page.run(DOCS / "robot-developer.md", instead=instead, before={replay: lambda: decide(page.folder / "lab.yaml")})
 

@@ -21,6 +21,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+from tests.bench.amending import amending_rows
 from tests.bench.calibration import calibration_rows
 from tests.bench.coding import coding_rows
 from tests.bench.console import console_rows
@@ -277,6 +278,7 @@ def _cpu_s(work: Callable[[], object]) -> float:
 
 PARTS: dict[str, Callable[[bool], Iterator[Row]]] = {
     "room": _room_rows,
+    "amending": amending_rows,
     "calibration": calibration_rows,
     "coding": coding_rows,
     "console": console_rows,

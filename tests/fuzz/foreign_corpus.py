@@ -1,6 +1,7 @@
 """Seeds of what other programs write: small bags of every kind, ROS messages one by one, files of cameras."""
 
 import json
+import struct
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,6 +14,9 @@ from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as Writer1
 from tests.fixtures.calib.foreign_rigs import KALIBR, ROS, ROS1_ECHO, ROS2_ECHO
 from tests.fixtures.fusion.bags import ROS1, ROS2, Messages, Timed, optical, png, write_bag
+from tests.fixtures.fusion.drive_mapping import TOPICS
+from tests.fixtures.fusion.live_drive import drive, wire_of
+from tests.fuzz.live_target import NAMES, TEXT
 from tests.fuzz.sections import joined
 
 from cairn_calib.exchange.placed_camera import PlacedCamera
@@ -44,6 +48,7 @@ def foreign_seeds() -> Iterator[Seed]:
         for topic, message in _messages(make):
             yield "ros-message", f"{topic}-{name}", f"{plain(message)} {name}\n".encode() + _wire(make, message)
     yield from _camera_files()
+    yield from _live_frames()
 
 
 def plain(message: Any) -> str:
@@ -182,3 +187,23 @@ def _camera_files() -> Iterator[Seed]:
     }
     for name, text in written.items():
         yield "camera-file", name, joined([(name.partition("-")[0], text.encode())])
+
+
+def _live_frames() -> Iterator[Seed]:
+    channels = [
+        {"id": n, "topic": name, "encoding": "cdr", "schemaName": TOPICS[name].type, "schema": "", "schemaEncoding": ""}
+        for n, name in enumerate(NAMES)
+    ]
+    texts = {
+        "hello": {"op": "serverInfo", "name": "mole", "capabilities": ["time"], "sessionId": "1"},
+        "advertise": {"op": "advertise", "channels": channels},
+        "unadvertise": {"op": "unadvertise", "channelIds": [0, 1]},
+        "status": {"op": "status", "level": 2, "message": "Unknown channel ID: 1"},
+    }
+    for name, content in texts.items():
+        yield "live", name, joined([(TEXT, json.dumps(content).encode())])
+    sent = drive(Messages(ROS2), scans=3)
+    frames = [
+        ("binary", struct.pack("<BIQ", 1, NAMES.index(topic), 1) + wire_of(message)) for _, topic, message in sent
+    ]
+    yield "live", "drive", joined(frames)

@@ -14,6 +14,7 @@ from tests.fuzz.begun_target import mutated_begun, read_begun
 from tests.fuzz.cell_mutator import mutated_cell
 from tests.fuzz.foreign_targets import mutated_message, read_bag, read_camera_file, read_ros_message
 from tests.fuzz.json_mutator import mutated_json
+from tests.fuzz.live_target import read_live
 from tests.fuzz.message_target import check_properties, read_message
 from tests.fuzz.png_mutator import mutated_png
 from tests.fuzz.sections import in_folder, mutated_sections, sections_of
@@ -275,4 +276,5 @@ TARGETS: dict[str, Target] = {
     "bag": Target(read_bag, mutated_sections),
     "ros-message": Target(read_ros_message, mutated_message),
     "camera-file": Target(read_camera_file, mutated_sections),
+    "live": Target(read_live, mutated_sections),
 }

@@ -14,6 +14,9 @@ KITTI poses.txt (12 numbers a line, by frame number), TUM (time tx ty tz qx qy q
 --T-body-sensor), nerfstudio's transforms.json (OpenGL axes, by image name), COLMAP's images.txt (map to camera, by
 image name), or a folder of 4x4 matrices, one text file a frame. Times are matched by interpolation. Without metric
 scale (nerfstudio, COLMAP) --scale is needed. What was read, under which conventions, is printed."""
+TRAJECTORY_TEXT = """--trajectory FILE has poses by time, in a form recognised by its content: TUM (time tx ty tz qx
+qy qz qw) or EuRoC's csv (poses of a body: --T-body-sensor). They are of the rig, or of the camera that --poses-of
+names. Times are matched by interpolation."""
 FIELD_OF_OPTION = {
     "poses": "path",
     "pose_convention": "convention",
@@ -34,6 +37,18 @@ def add_pose_arguments(command: argparse.ArgumentParser, *, scale: tuple[str, ..
     """Add the options, but for those that `add_convention_arguments` adds; `scale` are the names of one of them."""
     group = command.add_argument_group("poses of a published form", TEXT)
     group.add_argument("--poses", type=Path, metavar="FILE", help="pose file, or folder of matrices")
+    _add_reading(group, scale=scale)
+
+
+def add_trajectory_arguments(command: argparse.ArgumentParser) -> None:
+    """Add `--trajectory FILE` in the place of `--poses`, and all options that say how it is read."""
+    group = command.add_argument_group("the trajectory", TRAJECTORY_TEXT)
+    group.add_argument("--trajectory", dest="poses", required=True, type=Path, metavar="FILE", help="the new poses")
+    _add_reading(group, scale=("--scale",))
+    add_convention_arguments(command)
+
+
+def _add_reading(group: "argparse._ArgumentGroup", *, scale: tuple[str, ...]) -> None:
     group.add_argument(
         *scale, dest="pose_scale", type=float, metavar="METRES_PER_UNIT", help="length of one unit of the positions"
     )

@@ -8,6 +8,7 @@ from cairn_client.cli.arguments import add_token
 from cairn_client.replica.limits import KEEP_ACKED_S, Limits
 from cairn_client.sync.link_profile import LINKS
 from cairn_client.sync.scope import Scope
+from cairn_fusion.mapping.scan_gate import GateBounds, ScanGate
 from cairn_map.errors import BadInputError
 from cairn_map.render.pose_spread import PoseSpread
 from cairn_map.wire.messages import Mode
@@ -91,6 +92,40 @@ def kept_scans_bytes(args: argparse.Namespace) -> int:
     if not 0 <= megabytes < float("inf"):
         raise BadInputError("bad_option", f"--keep-scans takes megabytes of 0 or more, got {megabytes:g}")
     return round(megabytes * 1e6)
+
+
+def add_gate(command: argparse.ArgumentParser, *, standard: str) -> None:
+    """Add the options that say which scans are taken; `standard` says what holds without them."""
+    bounds = GateBounds()
+    group = command.add_argument_group(
+        "which scans are taken", f"A robot that stands still should not vote with every scan. {standard}"
+    )
+    for name, unit, value, text in (
+        ("m", "METRES", bounds.step_m, "after this way"),
+        ("deg", "DEGREES", bounds.turn_deg, "or this turn"),
+        ("s", "SECONDS", bounds.pause_s, "or this time"),
+    ):
+        group.add_argument(
+            f"--scan-every-{name}", type=float, metavar=unit, help=f"take a scan {text} since the last ({value:g})"
+        )
+    group.add_argument("--every-scan", action="store_true", help="take every scan")
+
+
+def gate_of(args: argparse.Namespace, *, is_standard: bool) -> ScanGate:
+    """The gate that the options describe; `is_standard`: there is one without options, too.
+
+    Raises:
+        BadInputError: a negative bound, or --every-scan with one.
+    """
+    given = {
+        "step_m": args.scan_every_m,
+        "turn_deg": args.scan_every_deg,
+        "pause_s": args.scan_every_s,
+    }
+    given = {name: value for name, value in given.items() if value is not None}
+    if args.every_scan and given:
+        raise BadInputError("bad_option", "--every-scan and --scan-every-m, -deg or -s exclude each other; give one")
+    return ScanGate(GateBounds(**given) if given or (is_standard and not args.every_scan) else None)
 
 
 def place(text: str) -> tuple[float, float, float]:

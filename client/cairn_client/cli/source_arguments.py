@@ -17,6 +17,11 @@ def add_source_arguments(command: argparse.ArgumentParser, *, scale: tuple[str, 
     command.add_argument(
         "--deskewed", action="store_true", help="points of clouds are moved to one time of their sweep already"
     )
+    add_up_arguments(command)
+
+
+def add_up_arguments(command: argparse.ArgumentParser) -> None:
+    """Add the options that say which way is up in the frame of the poses."""
     group = command.add_argument_group(
         "which way is up", "The map's z axis points up; `cairn robot inspect` proposes which axis of the poses does."
     )

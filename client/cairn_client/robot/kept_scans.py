@@ -2,6 +2,7 @@
 
     scans/open.partial                                the scans of the open measurement, as they come
     scans/000042.mole.0123456789abcdef.7.scans        those of commit 7, the 42nd file; the lowest number goes first
+    scans/4e9a...c1.rig.json                          a head that took some of them, by the digest that commits state
 
 A file is a row of scans (`scan_bytes`), each behind its length. It is written once, from its beginning to its end, and
 never flushed by force: that would wear the flash of a robot for what only helps. A power cut may cost the scans of the
@@ -21,14 +22,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
+from cairn_calib.rig.rig import Rig, load_rig
 from cairn_fusion.recording.scan import Scan
-from cairn_fusion.recording.scan_bytes import decode_scan, encode_scan, read_images
+from cairn_fusion.recording.scan_bytes import decode_scan, encode_scan, read_images, read_time
 from cairn_map.commits.ids import CommitId, commit_id_from_text
 from cairn_map.errors import BadInputError, DamagedDataError
 
 log = logging.getLogger(__name__)
 
 OPEN = "open.partial"
+RIG_SUFFIX = ".rig.json"
 LOST_MAX = 256
 """Commits of which it is remembered why their scans are not kept."""
 FILE_NAME = re.compile(r"([0-9]{6,})\.(.+)\.scans")
@@ -82,8 +85,8 @@ class KeptScans:
         """Commits whose scans are kept, oldest measurement first."""
         return [file.commit for file in self._files.values()]
 
-    def add(self, scan: Scan) -> None:
-        """Keep a scan of the open measurement; a scan that cannot be kept is logged, and is no failure."""
+    def add(self, scan: Scan, rig: Rig) -> None:
+        """Keep a scan of the open measurement, and its head; one that cannot be kept is logged, and is no failure."""
         if not self.bytes_max or self._given_up:
             return
         data = encode_scan(scan)
@@ -96,6 +99,7 @@ class KeptScans:
             self._make_room(len(record))
             if self._open is None:
                 self._folder.mkdir(parents=True, exist_ok=True)
+                self.keep_rig(rig)
                 self._open = (self._folder / OPEN).open("wb")
             self._open.write(record)
             self._open_bytes += len(record)
@@ -163,6 +167,41 @@ class KeptScans:
                     file.seek(start)
                     yield decode_scan(file.read(size))
                 file.seek(start + size)
+
+    def times_s(self, commit: CommitId) -> list[float]:
+        """Times of a commit's scans, in order; images are not read.
+
+        Raises:
+            DamagedDataError: as `scans`.
+        """
+        kept, times_s = self._files[commit], []
+        with kept.path.open("rb") as file:
+            while (size := _next_size(file, kept)) is not None:
+                start = file.tell()
+                times_s.append(read_time(file))
+                file.seek(start + size)
+        return times_s
+
+    def keep_rig(self, rig: Rig) -> None:
+        """Keep a head, by its digest.
+
+        Raises:
+            OSError: the disk does not take it.
+        """
+        path = self._folder / f"{rig.digest()}{RIG_SUFFIX}"
+        if not path.exists():
+            partial = path.with_suffix(".partial")
+            partial.write_bytes(rig.to_json())
+            partial.replace(path)
+
+    def rig(self, digest: str) -> Rig | None:
+        """The head of that digest; None: it is not kept.
+
+        Raises:
+            BadInputError: the disk damaged it.
+        """
+        path = self._folder / f"{digest}{RIG_SUFFIX}"
+        return load_rig(path) if path.exists() else None
 
     def why_gone(self, commit: CommitId) -> str:
         """Reason why the scans of a commit are not kept, with what to do about it."""

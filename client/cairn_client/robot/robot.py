@@ -302,7 +302,7 @@ class Robot:
             commit = self._end_epoch_before(scan)
             # The measurement first: it refuses what does not fit, before anything else has the scan.
             self._measurement.add(scan)
-            self._kept_scans.add(scan)
+            self._kept_scans.add(scan, self._measurement.rig)
             self._status.place_at(self._measurement.poses[-1])
             return commit
 

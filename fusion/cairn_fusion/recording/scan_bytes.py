@@ -84,14 +84,29 @@ def read_images(file: BinaryIO) -> frozenset[tuple[str, str, str, tuple[int, ...
         DamagedDataError: no scan begins there.
     """
     try:
-        (length,) = HEAD.unpack(file.read(HEAD.size))
-        arrays = json.loads(file.read(length))["arrays"]
         return frozenset(
             (str(kind), str(name), str(dtype), () if kind == "points" else tuple(shape))
-            for kind, name, dtype, shape in arrays
+            for kind, name, dtype, shape in _read_head(file)["arrays"]
         )
     except (struct.error, ValueError, KeyError, TypeError) as exc:
         raise DamagedDataError("damaged_scan", f"a kept scan is damaged: {exc}") from exc
+
+
+def read_time(file: BinaryIO) -> float:
+    """Time of the scan that begins at the file's place, seconds; images are not read.
+
+    Raises:
+        DamagedDataError: no scan begins there.
+    """
+    try:
+        return float(_read_head(file)["time_s"])
+    except (struct.error, ValueError, KeyError, TypeError) as exc:
+        raise DamagedDataError("damaged_scan", f"a kept scan is damaged: {exc}") from exc
+
+
+def _read_head(file: BinaryIO) -> Any:
+    (length,) = HEAD.unpack(file.read(HEAD.size))
+    return json.loads(file.read(length))
 
 
 def move_scan(scan: Scan, T_map_rig: Transform) -> Scan:

@@ -81,11 +81,16 @@ class TurnedSource:
 
 
 def turned_source(source: ScanSource, *, up: str | None = None, T_map_world: Path | None = None) -> ScanSource:
-    """A source in the frame of the map.
+    """A source in the frame of the map; arguments and errors are those of `map_from_world`."""
+    turn = map_from_world(up=up, T_map_world=T_map_world)
+    return source if turn is None else TurnedSource(source, *turn)
+
+
+def map_from_world(*, up: str | None = None, T_map_world: Path | None = None) -> tuple[Transform, str] | None:
+    """`T_map_world` from the frame of poses to that of the map, and the same in words; None: they are one frame.
 
     Args:
-        source: scans in the frame of their poses.
-        up: axis of that frame that points up, of `AXES_UP`; None or z: it is z.
+        up: axis of the poses' frame that points up, of `AXES_UP`; None or z: it is z.
         T_map_world: file with the transform from that frame to the map's, 16 or 12 numbers.
 
     Raises:
@@ -94,10 +99,10 @@ def turned_source(source: ScanSource, *, up: str | None = None, T_map_world: Pat
     if up is not None and T_map_world is not None:
         raise BadInputError("bad_option", "--up and --T-map-world are two statements of the same; give one of them")
     if T_map_world is not None:
-        return TurnedSource(source, body_sensor_of(T_map_world), f"T_map_world of {T_map_world.name} moves all poses")
+        return body_sensor_of(T_map_world), f"T_map_world of {T_map_world.name} moves all poses"
     if up in (None, "z"):
-        return source
-    return TurnedSource(source, rotation_up(up or "z"), f"up is {up} of the poses' frame: it becomes the map's z")
+        return None
+    return rotation_up(up or "z"), f"up is {up} of the poses' frame: it becomes the map's z"
 
 
 def rotation_up(up: str) -> Transform:

@@ -7,6 +7,7 @@ from array import array
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -129,7 +130,7 @@ def index_bag(
     wanted = set(bag.topics if topics is None else topics)
     index = BagIndex({name: TopicIndex(bag.topics[name]) for name in sorted(wanted)}, FrameTree(bag.path.name), {})
     for n, message in enumerate(bag.messages(wanted)):
-        _add(index, message, bag)
+        add_message(index, message, bag.path)
         if n >= MESSAGES_MAX:
             raise BadInputError("bag_too_large", f"{bag.path} has more than {MESSAGES_MAX} messages; split it")
         if on_message is not None:
@@ -138,14 +139,14 @@ def index_bag(
 
 
 @contextmanager
-def translate_message_damage(bag: Bag, message: BagMessage) -> Iterator[None]:
-    """Translate errors in a message's bytes into one with topic and time."""
+def translate_message_damage(source: Path | str, message: BagMessage) -> Iterator[None]:
+    """Translate errors in a message's bytes into one with its source, topic and time."""
     try:
         yield
     except ValueError as exc:
         raise DamagedDataError(
             "bad_message",
-            f"{bag.path}: the message of {message.topic} at {message.log_ns / 1e9:.6f} s is damaged: {exc}; leave the "
+            f"{source}: the message of {message.topic} at {message.log_ns / 1e9:.6f} s is damaged: {exc}; leave the "
             "topic out of the YAML, or record it again",
         ) from exc
 
@@ -163,16 +164,20 @@ def wire_of(topic: Topic) -> Wire:
     return topic.wire
 
 
-def _add(index: BagIndex, message: BagMessage, bag: Bag) -> None:
+def add_message(index: BagIndex, message: BagMessage, source: Path | str) -> None:
+    """Add a message of one of an index's topics.
+
+    Raises:
+        DamagedDataError: its bytes are none of its type, or it was recorded before the one before.
+        BadInputError: a frame hangs on two others, a pose is none, or there are too many of them.
+    """
     entry = index.topics[message.topic]
     if entry.log_ns and message.log_ns < entry.log_ns[-1]:
-        raise DamagedDataError(
-            "bad_bag", f"{bag.path}: messages of {message.topic} are not in the order of their times"
-        )
+        raise DamagedDataError("bad_bag", f"{source}: messages of {message.topic} are not in the order of their times")
     time_s = message.log_ns / 1e9
     topic = entry.topic
     if topic.wire is not None:
-        with translate_message_damage(bag, message):
+        with translate_message_damage(source, message):
             if topic.type in STAMPED:
                 header = read_header(message.data, topic.wire)
                 time_s = header.time_s

@@ -7,41 +7,28 @@ BagRecording.scan(i)          decode the images of one range image     each time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeVar
 from weakref import finalize
 
 import numpy as np
-import numpy.typing as npt
 
 from cairn_calib.rig.camera import Camera
-from cairn_calib.rig.lidar import AnyCamera, SpinningLidar
-from cairn_calib.rig.poses import Transform, inverse
-from cairn_calib.rig.rig import Rig, Spectrum, mount_camera
-from cairn_fusion.clouds.cloud_columns import cloud_of
-from cairn_fusion.clouds.deskew import deskewed, point_times
-from cairn_fusion.clouds.sweep_image import R_LIDAR_CAMERA, T_LIDAR_CAMERA, sweep_image
+from cairn_calib.rig.lidar import AnyCamera
+from cairn_calib.rig.poses import Transform
+from cairn_calib.rig.rig import Rig, mount_camera
+from cairn_fusion.clouds.sweep_image import T_LIDAR_CAMERA
 from cairn_fusion.recording.frame_poses import PoseOptions, read_frame_poses
 from cairn_fusion.recording.recording import measurements_of
-from cairn_fusion.recording.recording_format import (
-    Convention,
-    decode_kelvin,
-    decode_range,
-    range_from_radial,
-    range_from_z_depth,
-)
-from cairn_fusion.recording.scan import Scan, check_scan
-from cairn_fusion.ros.bag import Bag, BagMessage, Wire
-from cairn_fusion.ros.bag_index import BagIndex, TopicIndex, index_bag, translate_message_damage, wire_of
-from cairn_fusion.ros.bag_scans import BagScan, scans_of
-from cairn_fusion.ros.images import AnyImage, Pixels, amplitude_of, colour_of, depth_of, thermal_counts_of
-from cairn_fusion.ros.messages import COMPRESSED, IMAGE, POINTS, TRANSFORMS, read_compressed_image, read_image
+from cairn_fusion.recording.scan import Scan
+from cairn_fusion.ros.bag import Bag, BagMessage
+from cairn_fusion.ros.bag_index import BagIndex, TopicIndex, index_bag, wire_of
+from cairn_fusion.ros.bag_scans import scans_of
+from cairn_fusion.ros.messages import COMPRESSED, IMAGE, POINTS, TRANSFORMS
 from cairn_fusion.ros.open_bag import open_bag
-from cairn_fusion.ros.point_clouds import check_beams, read_points
-from cairn_fusion.ros.topic_mapping import BagMapping, LidarKind, MappedCamera, camera_of_info, mapping_from_yaml
+from cairn_fusion.ros.scan_decoder import ScanDecoder
+from cairn_fusion.ros.topic_mapping import BagMapping, MappedCamera, camera_of_info, mapping_from_yaml
 from cairn_fusion.ros.topic_proposal import Proposal, propose
 from cairn_map.errors import BadInputError, DamagedDataError, NotFoundError
 
-PixelsT = TypeVar("PixelsT", bound=Pixels)
 SKIP_MAX = 256
 """Messages that are skipped one by one; for more of them the bag is searched again."""
 
@@ -93,15 +80,14 @@ class BagRecording:
                 pose for a scan between others.
         """
         # Topics that are missing or of another type are refused before anything is computed.
-        self._mapping = mapping
-        self._bag = bag
-        self._topics = {topic: _images_of(index, topic, name, types) for topic, name, types in _image_topics(mapping)}
+        self._topics = {topic: images_of(index, topic, name, types) for topic, name, types in image_topics(mapping)}
         self._readers = {name: TopicReader(bag, entry) for name, entry in self._topics.items()}
         self.name = mapping.name
-        self.rig = _rig_of(index, mapping, self._topics)
+        self.rig = rig_of(index, mapping, self._topics)
         found = None if poses is None else read_frame_poses(poses, self.rig)
         self._scans, self._pose_at = scans_of(bag, index, mapping, self._topics, found)
-        self._is_deskewed = is_deskewed
+        types = {name: entry.topic for name, entry in self._topics.items()}
+        self._decoder = ScanDecoder(bag.path.name, mapping, self.rig, types, is_deskewed=is_deskewed)
         self.rounding = index.tree.rounding if found is None else found.rounding
         self.pose_notes: Sequence[str] = () if found is None else found.report()
         size = mapping.scans_per_measurement if scans_per_measurement is None else scans_per_measurement
@@ -137,75 +123,10 @@ class BagRecording:
         """
         if not 0 <= index < len(self):
             raise NotFoundError("no_such_scan", f"{self.name} has scans 0 to {len(self) - 1}, asked for {index}")
-        # The range image makes the scan; of other cameras the images that `scans_of` found for its time.
         found = self._scans[index]
-        cameras = self._mapping.cameras
-        own = cameras[found.camera]
-        xyz = None if own.lidar is None else self._sweep(own, found)
-        scan = Scan(
-            time_s=found.time_s,
-            T_map_rig=found.T_map_rig,
-            range_camera=found.camera,
-            range_m=self._range(own, found) if xyz is None else sweep_image(xyz, self._lidar(found.camera)),
-            points_m=None if xyz is None or not _is_loose(own) else (xyz @ R_LIDAR_CAMERA).astype(np.float32),
-            amplitude=self._amplitude(own, found),
-            colour={
-                name: self._pixels(camera.topic, found, colour_of)
-                for name, camera in cameras.items()
-                if camera.spectrum is Spectrum.COLOUR and camera.topic in found.images
-            },
-            thermal={
-                name: decode_kelvin(self._pixels(camera.topic, found, thermal_counts_of), camera.thermal_encoding)
-                for name, camera in cameras.items()
-                if camera.spectrum is Spectrum.THERMAL and camera.topic in found.images
-            },
+        return self._decoder.decode(
+            found, lambda topic: self._readers[topic].message(found.images[topic]), self._pose_at
         )
-        check_scan(scan, self.rig)
-        return scan
-
-    def _range(self, camera: MappedCamera, found: BagScan) -> npt.NDArray[np.float32]:
-        """(H, W) metres along the beam."""
-        return _range_of(self._pixels(camera.topic, found, depth_of), self.rig[found.camera].camera, camera)
-
-    def _sweep(self, camera: MappedCamera, found: BagScan) -> npt.NDArray[np.float64]:
-        """(N, 3) the points of a lidar's cloud, metres, its own frame; of a known lidar they must lie on its beams."""
-        message = self._readers[camera.topic].message(found.images[camera.topic])
-        with translate_message_damage(self._bag, message):
-            points = read_points(message.data, wire_of(self._topics[camera.topic].topic))
-            xyz = points.xyz()
-        if not _is_loose(camera):
-            check_beams(xyz, self._lidar(found.camera), found.camera)
-            return xyz
-        place = f"{self._bag.path.name}: {camera.topic} at {found.time_s:.6f} s"
-        cloud = cloud_of({name: points.column(name) for name in points.fields}, place)
-        times = None if self._is_deskewed or self._pose_at is None else point_times(cloud, place)
-        if times is None or self._pose_at is None:
-            return cloud.points.astype(np.float64)
-        # The way of the lidar, which is fixed on the base.
-        T_base_lidar, way = self.rig[found.camera].transform @ inverse(T_LIDAR_CAMERA), self._pose_at
-        moved = deskewed(
-            cloud.points, times.absolute_s(found.time_s, place), found.time_s, lambda time_s: way(time_s) @ T_base_lidar
-        )
-        return moved.astype(np.float64)
-
-    def _lidar(self, name: str) -> SpinningLidar:
-        lidar = self.rig[name].camera
-        assert isinstance(lidar, SpinningLidar)  # noqa: S101 - `_camera_of` made it so
-        return lidar
-
-    def _amplitude(self, camera: MappedCamera, found: BagScan) -> npt.NDArray[np.uint16] | None:
-        has_one = camera.amplitude is not None and camera.amplitude in found.images
-        return self._pixels(camera.amplitude or "", found, amplitude_of) if has_one else None
-
-    def _pixels(self, topic: str, found: BagScan, decode: Callable[[AnyImage, str], PixelsT]) -> PixelsT:
-        """The pixels of a scan's image of one topic."""
-        message = self._readers[topic].message(found.images[topic])
-        entry = self._topics[topic]
-        with translate_message_damage(self._bag, message):
-            read: Callable[[bytes | memoryview, Wire], AnyImage]
-            read = read_image if entry.topic.type == IMAGE else read_compressed_image
-            image = read(message.data, wire_of(entry.topic))
-            return decode(image, f"{self._bag.path.name}: {topic} at {message.log_ns / 1e9:.6f} s")
 
 
 def open_bag_recording(
@@ -242,20 +163,20 @@ def open_bag_recording(
         raise
 
 
-def _is_loose(camera: MappedCamera) -> bool:
-    """True if a topic's points have no raster."""
-    return camera.lidar is not None and camera.lidar.kind is LidarKind.CLOUD
-
-
-def _image_topics(mapping: BagMapping) -> Iterator[tuple[str, str, tuple[str, ...]]]:
-    """Topics of pixels, each with its camera and the types that it may have."""
+def image_topics(mapping: BagMapping) -> Iterator[tuple[str, str, tuple[str, ...]]]:
+    """Topics of pixels and points, each with its camera and the types that it may have."""
     for name, camera in mapping.cameras.items():
         yield camera.topic, name, (POINTS,) if camera.lidar else (IMAGE, COMPRESSED)
         if camera.amplitude is not None:
             yield camera.amplitude, name, (IMAGE, COMPRESSED)
 
 
-def _images_of(index: BagIndex, topic: str, camera: str, types: tuple[str, ...]) -> TopicIndex:
+def images_of(index: BagIndex, topic: str, camera: str, types: tuple[str, ...]) -> TopicIndex:
+    """The topic of a camera's images.
+
+    Raises:
+        BadInputError: it is of another type, coded as ROS does not, or without messages.
+    """
     entry = index.topics[topic]
     if entry.topic.type not in types:
         raise BadInputError(
@@ -267,8 +188,12 @@ def _images_of(index: BagIndex, topic: str, camera: str, types: tuple[str, ...])
     return entry
 
 
-def _rig_of(index: BagIndex, mapping: BagMapping, topics: Mapping[str, TopicIndex]) -> Rig:
-    """The cameras at their places on the base."""
+def rig_of(index: BagIndex, mapping: BagMapping, topics: Mapping[str, TopicIndex]) -> Rig:
+    """The cameras at their places on the base.
+
+    Raises:
+        BadInputError: a camera has no calibration, or its frame is not fixed on the base.
+    """
     cameras = {}
     for name, camera in mapping.cameras.items():
         if camera.T_base_camera is not None:
@@ -294,14 +219,6 @@ def _camera_of(index: BagIndex, name: str, camera: MappedCamera) -> AnyCamera:
             "no_messages", f"camera {name}: {camera.info} has no CameraInfo messages; give intrinsics instead of info"
         )
     return camera_of_info(info, is_rectified=camera.is_rectified, name=f"camera {name}, {camera.info}")
-
-
-def _range_of(pixels: Pixels, camera: AnyCamera, mapped: MappedCamera) -> npt.NDArray[np.float32]:
-    """(H, W) float32, metres along the beam."""
-    if pixels.dtype == np.uint16:
-        return decode_range(pixels.astype(np.uint16, copy=False), camera, mapped.range_encoding)
-    convert = range_from_z_depth if mapped.convention is Convention.Z else range_from_radial
-    return convert(pixels, camera, units_per_m=1.0)
 
 
 @dataclass(frozen=True, slots=True)

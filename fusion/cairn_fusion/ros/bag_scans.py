@@ -62,7 +62,7 @@ def scans_of(
     lists = {name: _by_time(entry) for name, entry in topics.items()}
     if poses is not None:
         return _scans_with_poses(bag, mapping, lists, poses), poses.pose_near if poses.is_by_time else None
-    pose_at, first_s, last_s = _poses_of(index, mapping)
+    pose_at, first_s, last_s = poses_of(index, mapping)
     scans: list[BagScan] = []
     for name, camera in mapping.cameras.items():
         if camera.spectrum is not Spectrum.RANGE:
@@ -78,7 +78,7 @@ def scans_of(
                 camera.topic,
             )
         for time_s in times_s[has_pose].tolist():
-            images = _images_near(mapping, camera, lists, time_s)
+            images = images_near(mapping, camera, lists, time_s)
             scans.append(BagScan(time_s=time_s, T_map_rig=pose_at(time_s), camera=name, images=images))
     if not scans:
         raise BadInputError(
@@ -106,16 +106,16 @@ def _scans_with_poses(
         for n, (time_s, _, camera) in enumerate(found)
     ]
     return tuple(
-        BagScan(time_s=time_s, T_map_rig=T, camera=name, images=_images_near(mapping, camera, lists, time_s))
+        BagScan(time_s=time_s, T_map_rig=T, camera=name, images=images_near(mapping, camera, lists, time_s))
         for (time_s, name, camera), T in zip(found, poses.of_frames(keys), strict=True)
         if T is not None
     )
 
 
-def _images_near(
+def images_near(
     mapping: BagMapping, camera: MappedCamera, lists: Mapping[str, TimedList[int]], time_s: float
 ) -> dict[str, int]:
-    """The images of one scan: the range image itself, and the nearest of every other topic."""
+    """The images of one scan: the range image itself, and the nearest of every other topic, earlier one of a tie."""
     others = [other.topic for other in mapping.cameras.values() if other.spectrum is not Spectrum.RANGE]
     images = {camera.topic: lists[camera.topic].nearest(time_s, max_gap_s=0.0)}
     for topic in [*others, *([camera.amplitude] if camera.amplitude else [])]:
@@ -129,8 +129,12 @@ def _by_time(entry: TopicIndex) -> TimedList[int]:
     return TimedList(times_s, tuple(first.tolist()))
 
 
-def _poses_of(index: BagIndex, mapping: BagMapping) -> tuple[Callable[[float], Transform], float, float]:
-    """`T_map_base` by time, and the first and last time of it."""
+def poses_of(index: BagIndex, mapping: BagMapping) -> tuple[Callable[[float], Transform], float, float]:
+    """`T_map_base` by time, and the first and last time of it.
+
+    Raises:
+        BadInputError: the topic holds no poses, or no way leads between the two frames.
+    """
     frames, poses = mapping.frames, mapping.poses
     entry = index.topics[poses.topic]
     if entry.topic.type in TRANSFORMS:

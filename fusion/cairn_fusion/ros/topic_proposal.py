@@ -27,6 +27,7 @@ THERMAL_WORDS = re.compile(r"therm|lwir|flir|boson|lepton|tau2|optris|seek")
 IGNORED_WORDS = re.compile(r"confidence|theora|ffmpeg|aligned_.*_mask|segmentation|label")
 CAMERA_WORDS = re.compile(r"depth|camera|stereo|rgb|color")
 """Words in the names of clouds that a depth camera's driver makes from its images."""
+WORLD_FRAMES = ("odom", "map", "world", "earth")
 TOLERANCE_S = (0.005, 0.05)
 """Least and greatest proposal of `time_tolerance_s`: half the time between range images, within these."""
 GAP_S = (0.1, 5.0)
@@ -85,13 +86,15 @@ class Guess:
         return "rect" in self.entry.topic.name.rsplit("/", 1)[-1]
 
 
-def propose(index: BagIndex, path: Path) -> Proposal:
+def propose(index: BagIndex, path: Path, *, command: str | None = None) -> Proposal:
     """Mapping that fits an index of all topics best.
 
     Args:
         index: of the whole bag.
         path: of the bag; names the recording.
+        command: command that takes the file; None: the replay of a bag.
     """
+    command = command or f"cairn robot replay {path.name}"
     # Stage 1: cameras by their names and encodings. Each stage adds the questions that it cannot answer.
     questions: list[str] = []
     cameras = _cameras(index, questions)
@@ -106,7 +109,7 @@ def propose(index: BagIndex, path: Path) -> Proposal:
     tolerance_s = float(np.clip(0.5 / rate_hz if rate_hz else 0.02, *TOLERANCE_S))
     # Stage 3: the text, with the questions as comments.
     lines = [
-        f"# Which topics of {path.name} are what: cairn robot replay {path.name} --topics THIS_FILE --map URL",
+        f"# Which topics of {path.name} are what: {command} --topics THIS_FILE --map URL",
         *(f"# {DECIDE}: {question}" for question in questions),
         f"name: {_quoted(_name(path))}",
         *pose_lines,
@@ -222,6 +225,9 @@ def _pose_lines(index: BagIndex, camera_frame: str, questions: list[str]) -> lis
     way = index.tree.way_up(camera_frame) if camera_frame else []
     moving = [child for child in way[:-1] if not index.tree.edges[child].is_fixed]
     tracks = {topic: next(iter(track.edges.items())) for topic, track in index.tracks.items()}
+    if not moving and not tracks:  # a robot at rest: REP 105 names the frames in which it moves
+        edges = [(child, index.tree.edges[child]) for child in way[:-1]]
+        moving = [child for child, edge in edges if not edge.is_static and edge.parent in WORLD_FRAMES]
     # A moving edge above the camera; else the only topic of odometry or poses; else a question.
     if moving:
         topic, base, root = next(t for t in [*tf_topics] if "static" not in t), moving[0], way[-1]

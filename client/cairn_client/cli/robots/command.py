@@ -4,10 +4,12 @@
     shelf: 15 scans; the first has 26% of its pixels, median range 0.57 m
     replayed 15 scans as 15 commits in 1.9 s (7.9 scans/s), 302.0 kB up, 62.8 kB down, 0 commits wait
     $ cairn robot run spool/ --map http://127.0.0.1:8750/maps/shelf --name mole
+    $ cairn robot live ws://robot:8765 --map http://127.0.0.1:8750/maps/shelf --name mole
     $ cairn robot status cairn-shelf/
     $ cairn robot queue cairn-shelf/
     $ cairn robot sync cairn-shelf/
     $ cairn robot sync mole/ --map http://127.0.0.1:8750/maps/shelf --mode low-end --near 4,2,0
+    $ cairn robot amend cairn-shelf/ --trajectory optimised.tum
 
 `replay` reads a recording folder (RECORDING.md), a bag of ROS 1 or ROS 2 (.bag, .mcap, .db3; `cairn robot inspect`
 lists its topics and proposes --topics), a known layout as it was published (apc_shelf_rgbd, mm5_rgbdt), or any folder
@@ -26,8 +28,10 @@ cells that share more than a face with this box; and in short replies: with --re
 commits that take more work and four tenths fewer bytes, and sends them in parts of 16 kB, so that a link that breaks
 goes on where it stopped. On every link the cells around the robot come first.
 
-`run` maps the recordings that a driver puts into a folder, and syncs, until a signal ends it. `status` and `queue` look
-into a robot's folder, also while the robot is at work.
+`run` maps the recordings that a driver puts into a folder, and syncs, until a signal ends it. `live` maps what a robot
+with ROS sees, through its Foxglove bridge, as it sees it. `status` and `queue` look
+into a robot's folder, also while the robot is at work. `amend` moves past measurements to the poses of a
+trajectory that a SLAM corrected.
 """
 
 import argparse
@@ -36,7 +40,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from cairn_client.cli.arguments import Subparsers, run_subcommand, say, shown_age, shown_bytes
-from cairn_client.cli.robots import inspect, replay, run, sync
+from cairn_client.cli.robots import amend, inspect, live, replay, run, sync
 from cairn_client.folders.folder_status import FolderStatus, QueuedCommit, folder_queue, folder_status
 from cairn_map.errors import BadInputError
 
@@ -73,7 +77,16 @@ def main(argv: list[str]) -> int:
             "there is no `cairn robot pull`: `cairn robot sync DIR --map URL` does the same (a copy to look at: "
             "`cairn clone`)",
         )
-    parts = (replay.add_parser, inspect.add_parser, run.add_parser, _add_status, _add_queue, sync.add_parser)
+    looking = (_add_status, _add_queue)
+    parts = (
+        replay.add_parser,
+        inspect.add_parser,
+        run.add_parser,
+        live.add_parser,
+        *looking,
+        sync.add_parser,
+        amend.add_parser,
+    )
     return run_subcommand("cairn robot", __doc__, parts, argv)
 
 

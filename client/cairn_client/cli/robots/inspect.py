@@ -30,22 +30,53 @@ file that says which of them are depth, colour, thermal images and poses. It nee
     $ cairn robot inspect lab.bag --output lab.yaml
     $ cairn robot replay lab.bag --topics lab.yaml --map URL --voxel 0.04
 
+A live robot is listened to for some seconds through its Foxglove bridge, and the same file proposed for `live`:
+
+    $ cairn robot inspect ws://robot:8765 --output live.yaml
+    $ cairn robot live ws://robot:8765 --topics live.yaml --map URL --voxel 0.04
+
 Facts that a bag does not hold stand at the head of the file as `DECIDE`; `replay` without --topics works where there is
 nothing to decide."""
 
 
 def _inspect(args: argparse.Namespace) -> int:
     from cairn_fusion.importers import SourceLayout, detect_layout
-    from cairn_fusion.ros.bag_recording import survey
 
+    if isinstance(args.bag, str):
+        _check_output(args)
+        return _show_survey(args, _listen(args.bag, args.seconds))
     is_bag = args.depth is None and detect_layout(args.bag) is SourceLayout.BAG
     if not is_bag or args.topics is not None:
         _show_source(args)
         return 0
-    if args.output is not None and args.output.exists() and not args.force:
-        raise ConflictError("file_exists", f"{args.output} exists; --force writes over it")
+    _check_output(args)
+    from cairn_fusion.ros.bag_recording import survey
+
     with counting(args.bag.name, "messages") as on_message:
         found = survey(args.bag, on_message=on_message)
+    return _show_survey(args, found)
+
+
+def _listen(url: str, seconds: float) -> "Survey":
+    """Survey of a live robot."""
+    from cairn_client.live.foxglove_source import FoxgloveSource
+    from cairn_client.live.live_opening import survey_live
+
+    source = FoxgloveSource(url)
+    try:
+        with counting(url, "messages") as on_message:
+            return survey_live(source, seconds=seconds, on_message=on_message)
+    finally:
+        source.close()
+
+
+def _check_output(args: argparse.Namespace) -> None:
+    if args.output is not None and args.output.exists() and not args.force:
+        raise ConflictError("file_exists", f"{args.output} exists; --force writes over it")
+
+
+def _show_survey(args: argparse.Namespace, found: "Survey") -> int:
+    """Write what a bag or a live robot holds, and the proposal."""
     if args.output is not None:
         args.output.write_text(found.proposal.text, encoding="utf-8")
     if args.json:
@@ -168,9 +199,22 @@ def add_parser(commands: Subparsers) -> None:
         help="say what a recording holds; of a bag of ROS, propose the topics to map",
         description=TEXT,
     )
-    inspect.add_argument("bag", type=Path, metavar="RECORDING", help="anything that replay takes")
+    inspect.add_argument(
+        "bag",
+        type=_recording,
+        metavar="RECORDING",
+        help="anything that replay takes, or ws://HOST:PORT of a live robot",
+    )
+    inspect.add_argument(
+        "--seconds", type=float, default=5.0, metavar="S", help="time for which a live robot is listened to (5)"
+    )
     inspect.add_argument("-o", "--output", type=Path, metavar="YAML", help="write the proposed file there")
     inspect.add_argument("--force", action="store_true", help="write over a file that exists")
     inspect.add_argument("--json", action="store_true", help="print JSON")
     add_source_arguments(inspect)
     inspect.set_defaults(run=_inspect)
+
+
+def _recording(text: str) -> Path | str:
+    """A path, or the URL of a live robot as it stands."""
+    return text if "://" in text else Path(text)

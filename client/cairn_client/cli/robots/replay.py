@@ -3,18 +3,20 @@
 import argparse
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from cairn_client.cli.arguments import Subparsers, api_of, say, shown_bytes, shown_length
 from cairn_client.cli.range_arguments import add_ranges, integrator_of, returns_line
-from cairn_client.cli.robot_arguments import add_kept_scans, add_map, kept_scans_bytes, scope_of
+from cairn_client.cli.robot_arguments import add_gate, add_kept_scans, add_map, gate_of, kept_scans_bytes, scope_of
 from cairn_client.cli.source_arguments import add_source_arguments, asked_source
 from cairn_client.http.api import MapApi
 from cairn_client.robot.robot import Robot
 from cairn_fusion.mapping.grouping import Grouping, OpenGroup
+from cairn_fusion.mapping.scan_gate import ScanGate
 from cairn_fusion.recording.recording import ScanSource
 from cairn_fusion.recording.turned_source import TurnedSource
 from cairn_fusion.recording.upright import upright_of
@@ -39,11 +41,11 @@ SYNC_EVERY_S = 2.0
 
 def _replay(args: argparse.Namespace) -> int:
     # What to replay, and on which map.
-    size = args.scans_per_measurement
+    size, gate = args.scans_per_measurement, gate_of(args, is_standard=False)
     source = asked_source(args.recording, args, scans_per_measurement=size)
     _say_range(source)
     _say_doubts(source, args)
-    layer = ensure_map(args, source)
+    layer = ensure_map(args, partial(channels_of, source))
     name = args.name or default_name(source.name)
     state = args.state or Path(f"cairn-{name}")
     part = f"{args.recording.resolve()} {args.share[0]}/{args.share[1]}"
@@ -76,7 +78,7 @@ def _replay(args: argparse.Namespace) -> int:
     ) as robot:
         if robot.replica.layer.has_epochs:
             _missed_sync(robot)  # it learns the server's time, by which epochs are counted
-        commits = _map_stops(robot, source, stops, Profile(args.profile) if args.profile else None, group)
+        commits = _map_stops(robot, source, stops, Profile(args.profile) if args.profile else None, group, gate)
         with (state / REPLAYED_FILE).open("a") as file:
             file.write(f"{part}\n")
         mapped_s = time.monotonic() - start_s
@@ -89,6 +91,8 @@ def _replay(args: argparse.Namespace) -> int:
         f"replayed {scans} scans as {commits} commits in {mapped_s:.1f} s ({scans / mapped_s:.1f} scans/s), "
         f"{shown_bytes(traffic.up_bytes)} up, {shown_bytes(traffic.down_bytes)} down, {waiting} commits wait"
     )
+    if gate.kept_out:
+        say(f"{gate.kept_out} of these scans were taken by a robot that had not moved, and are not mapped")
     say(returns_line(returns))
     if is_folded:
         say(f"all of it is in the server's map: {total_s:.1f} s in all, with push and fold")
@@ -99,7 +103,12 @@ def _replay(args: argparse.Namespace) -> int:
 
 
 def _map_stops(
-    robot: Robot, source: ScanSource, stops: Sequence[range], profile: Profile | None, group: OpenGroup | None
+    robot: Robot,
+    source: ScanSource,
+    stops: Sequence[range],
+    profile: Profile | None,
+    group: OpenGroup | None,
+    gate: ScanGate,
 ) -> int:
     """Map measurements, or single scans by a grouping, with a sync now and then; the number of commits made."""
     commits, last_sync_s = 0, time.monotonic()
@@ -108,6 +117,8 @@ def _map_stops(
     for stop in with_progress(stops, source.name, total=len(stops)):
         for index in stop:
             scan = source.scan(index)
+            if not gate.takes(scan.range_camera, scan.time_s, scan.T_map_rig):
+                continue
             if group is not None and group.ends_before(scan.time_s, scan.T_map_rig):
                 commits += _commit(robot, profile, note) is not None
             commits += robot.observe(scan) is not None
@@ -182,21 +193,26 @@ def _is_folded(robot: Robot) -> bool:
         return False
 
 
-def ensure_map(args: argparse.Namespace, source: ScanSource) -> MapLayer | None:
-    """The map's grid and epochs, of a new map if there is none; None without a link: the state folder may know it."""
+def ensure_map(args: argparse.Namespace, channels: Callable[[], tuple[Channel, ...]]) -> MapLayer | None:
+    """The map's grid and epochs; if there is no map, a new one's, of these channels.
+
+    None without a link: the state folder may know it.
+    """
     api, name = api_of(args.map, args.token)
     with api:
-        return _ensured(api, name, args, source)
+        return _ensured(api, name, args, channels)
 
 
-def _ensured(api: MapApi, name: str, args: argparse.Namespace, source: ScanSource) -> MapLayer | None:
+def _ensured(
+    api: MapApi, name: str, args: argparse.Namespace, channels: Callable[[], tuple[Channel, ...]]
+) -> MapLayer | None:
     wished = geometry_for(voxel_edge_m=args.voxel) if args.voxel is not None else None
     try:
         layer = api.map_info(name).layer
     except UnreachableError:
         if not args.voxel:
             return None
-        return MapLayer(geometry=geometry_for(voxel_edge_m=args.voxel, channels=_channels(source)))
+        return MapLayer(geometry=geometry_for(voxel_edge_m=args.voxel, channels=channels()))
     except NotFoundError as exc:
         if exc.kind != "no_map":
             raise
@@ -204,7 +220,7 @@ def _ensured(api: MapApi, name: str, args: argparse.Namespace, source: ScanSourc
             raise BadInputError(
                 "no_map", f"there is no map {name} yet; make one with `cairn map create`, or give --voxel METRES"
             ) from exc
-        made = geometry_for(voxel_edge_m=args.voxel, channels=_channels(source))
+        made = geometry_for(voxel_edge_m=args.voxel, channels=channels())
         return api.create_map(name, CreateMap(geometry=made, epoch_s=STANDARD_EPOCH_S)).layer
     geometry = layer.geometry
     if wished is not None and wished.voxel_edge_um != geometry.voxel_edge_um:
@@ -216,7 +232,7 @@ def _ensured(api: MapApi, name: str, args: argparse.Namespace, source: ScanSourc
     return layer
 
 
-def _channels(source: ScanSource) -> tuple[Channel, ...]:
+def channels_of(source: ScanSource) -> tuple[Channel, ...]:
     """Channels that the recording's first scan can fill."""
     scan = source.scan(0)
     has = ((COLOUR, bool(scan.colour)), (INTENSITY, scan.amplitude is not None), (TEMPERATURE, bool(scan.thermal)))
@@ -250,6 +266,11 @@ def add_parser(commands: Subparsers) -> None:
         f"{bounds.seconds_max:g} s and {bounds.metres_max:g} m)",
     )
     add_ranges(replay)
+    add_gate(
+        replay,
+        standard="A replay takes every scan of a recording, unless one of these options is given; the two others then "
+        "have the values of a live robot.",
+    )
     replay.add_argument("--state", type=Path, metavar="DIR", help="the robot's folder (cairn-NAME)")
     add_kept_scans(replay)
     replay.add_argument("--mode", choices=("high-end", "low-end"), default="high-end")

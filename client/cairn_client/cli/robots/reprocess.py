@@ -23,8 +23,7 @@ import argparse
 import os
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from itertools import groupby
+from collections.abc import Sequence
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
@@ -32,17 +31,21 @@ from pydantic import BaseModel, ConfigDict
 from cairn_calib.rig.rig import load_rig
 from cairn_client.cli.arguments import parser, say
 from cairn_client.cli.maps.command import rig_digest
+from cairn_client.cli.robots.left_measurements import (
+    LeftMeasurements,
+    check_note,
+    raise_left,
+    say_left,
+    shown_measurements,
+)
 from cairn_client.folders.folder_workers import folder_workers
 from cairn_client.folders.reprocessing import FolderPlan, FolderReport, Recipe
 from cairn_client.folders.state_folder import check_state_folder
 from cairn_map.codec.cell_code import Profile
-from cairn_map.commits.ids import CommitId
-from cairn_map.errors import BadInputError, NotFoundError
+from cairn_map.errors import BadInputError
 
 NOTE = "reprocessed"
 """Note of the amends, unless --note says more."""
-NOTE_MAX = 1024
-"""Most characters of a commit's note."""
 
 
 class ReprocessedFolder(BaseModel):
@@ -107,7 +110,7 @@ def _reprocess(args: argparse.Namespace) -> int:
         processes = "1 process" if jobs == 1 else f"{jobs} processes"
         sync = "; ".join(f"cairn robot sync {report.plan.folder}" for report in reports if report.waiting)
         say(f"took {time.monotonic() - start_s:.1f} s in {processes}" + (f"; push them: {sync}" if sync else ""))
-    _raise_what_is_left(reports)
+    raise_left([_left(report) for report in reports])
     return 0
 
 
@@ -121,8 +124,7 @@ def _recipe(args: argparse.Namespace) -> Recipe:
         note=args.note,
     )
     recipe.integrator("")
-    if len(args.note) > NOTE_MAX:
-        raise BadInputError("bad_meta", f"a note has at most {NOTE_MAX} characters, got {len(args.note)}")
+    check_note(args.note)
     return recipe
 
 
@@ -186,46 +188,13 @@ def _model(report: FolderReport, *, is_dry: bool) -> ReprocessedFolder:
 def _say_folder(report: FolderReport, *, is_dry: bool) -> None:
     plan = report.plan
     count = len(plan.to_amend) if is_dry else report.amended
-    line = f"{plan.folder}: {_measurements(count)} of {plan.robot} {'would be ' * is_dry}amended"
+    line = f"{plan.folder}: {shown_measurements(count)} of {plan.robot} {'would be ' * is_dry}amended"
     left = (plan.done, "done before"), (plan.taken_back, "taken back"), (plan.other_rig, "of other rigs")
     for number, text in left:
         line += f", {number} {text}" if number else ""
     say(line if is_dry else f"{line}; {report.waiting} commits wait")
-    if plan.lost:
-        say(f"  the scans of {len(plan.lost)} are not kept any more: {', '.join(_ranges(plan.lost))}")
-    for commit, exc in plan.failed.items():
-        say(f"  {commit} stays as it is: {exc.message} [{exc.kind}]")
-    if report.stopped is not None:
-        say(f"  stopped: {report.stopped.message} [{report.stopped.kind}]")
+    say_left(_left(report))
 
 
-def _measurements(count: int) -> str:
-    return "1 measurement" if count == 1 else f"{count} measurements"
-
-
-def _ranges(commits: Sequence[CommitId]) -> Iterator[str]:
-    """Ids, those of a row as `mole.5f0c2a9be1d3f607.0-11`."""
-    ordered = sorted(commits, key=lambda commit: (commit.author, commit.n))
-    for _, group in groupby(enumerate(ordered), key=lambda item: (item[1].author, item[1].n - item[0])):
-        row = [commit for _, commit in group]
-        yield str(row[0]) if len(row) == 1 else f"{row[0]}-{row[-1].n}"
-
-
-def _raise_what_is_left(reports: Sequence[FolderReport]) -> None:
-    """Raise what the exit code is to say of a run that is over: the first error, else measurements without scans.
-
-    Raises:
-        CairnError: of the first folder or measurement that failed.
-        NotFoundError: kind `no_scans`: the scans of some measurements are not kept.
-    """
-    errors = [report.stopped for report in reports if report.stopped is not None]
-    errors += [exc for report in reports for exc in report.plan.failed.values()]
-    if errors:
-        raise errors[0]
-    lost = sum(len(report.plan.lost) for report in reports)
-    if lost:
-        raise NotFoundError(
-            "no_scans",
-            f"{_measurements(lost)} cannot be integrated again: their scans are not kept, and they stay as they are. "
-            "Keep more with --keep-scans, or take them out: cairn map retract --rig",
-        )
+def _left(report: FolderReport) -> LeftMeasurements:
+    return LeftMeasurements(lost=report.plan.lost, failed=report.plan.failed, stopped=report.stopped)

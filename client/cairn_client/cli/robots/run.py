@@ -19,13 +19,14 @@ the next start. A second ^C ends it at once, and nothing is lost.
 import argparse
 import logging
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from cairn_client.cli.arguments import Subparsers, say, shown_bytes
 from cairn_client.cli.event_lines import Stopping, lines_on_stderr, until_signal
 from cairn_client.cli.range_arguments import add_ranges, integrator_of, returns_line
 from cairn_client.cli.robot_arguments import add_kept_scans, add_limits, add_map, kept_scans_bytes, limits_of, scope_of
-from cairn_client.cli.robots.replay import default_name, ensure_map
+from cairn_client.cli.robots.replay import channels_of, default_name, ensure_map
 from cairn_client.folders.spool import Spool, Stop, remember
 from cairn_client.folders.state_folder import is_state_folder
 from cairn_client.robot.robot import Robot
@@ -126,7 +127,7 @@ def _robot(args: argparse.Namespace, spool: Spool, stopping: Stopping) -> Robot 
         name=name,
         token=args.token.of(args.map),
         mode=args.mode,
-        geometry=ensure_map(args, source) if source else None,
+        geometry=ensure_map(args, partial(channels_of, source)) if source else None,
         integrator=integrator_of(args),
         scope=scope_of(args, args.mode),
         limits=limits_of(args),

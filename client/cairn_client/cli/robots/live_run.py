@@ -1,0 +1,183 @@
+"""Run of `cairn robot live`: a live source opened, mapped by a robot until a signal comes, and its status written."""
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+from cairn_calib.rig.rig import Spectrum
+from cairn_client.cli.arguments import say
+from cairn_client.cli.event_lines import Stopping, lines_on_stderr, until_signal
+from cairn_client.cli.range_arguments import integrator_of, returns_line
+from cairn_client.cli.robot_arguments import gate_of, kept_scans_bytes, limits_of, scope_of
+from cairn_client.cli.robots.replay import default_name, ensure_map
+from cairn_client.live.foxglove_source import FoxgloveSource
+from cairn_client.live.live_mapping import LiveMapping
+from cairn_client.live.live_opening import OpenedLive, open_live, survey_live
+from cairn_client.live.live_status import LiveStatus, StatusWatch
+from cairn_client.robot.robot import Robot
+from cairn_fusion.ros.scan_decoder import ScanDecoder
+from cairn_fusion.ros.topic_mapping import BagMapping, mapping_from_yaml, mapping_of
+from cairn_map.codec.cell_code import Profile
+from cairn_map.errors import USAGE, BadInputError, CairnError
+from cairn_map.evidence.channels import COLOUR, INTENSITY, TEMPERATURE, Channel
+from cairn_map.progress import StatusLine
+
+SURVEY_S = 3.0
+"""Time for which topics are listened to where no file names them."""
+TAKE_S = 0.1
+"""Longest wait for messages."""
+TERMINAL_EVERY_S, LOG_EVERY_S, JSON_EVERY_S = 0.5, 10.0, 1.0
+"""Pauses between two status lines."""
+FLUSH_S = 8.0
+"""Longest push of waiting commits at the end: containers are killed ten seconds after they are asked to stop."""
+
+
+def run_live(args: argparse.Namespace) -> int:
+    """Open the source and map until a signal comes; the exit code."""
+    with until_signal() as stopping:
+        source = None
+        try:
+            # Everything that can be refused is, before anything is mapped.
+            gate_of(args, is_standard=True)
+            limits = limits_of(args)
+            kept_bytes = kept_scans_bytes(args)
+            if args.every <= 0:
+                raise BadInputError("bad_option", f"--every takes seconds above 0, got {args.every:g}")
+            mapping = _mapping(args)
+            source = FoxgloveSource(args.source)
+            opened = open_live(source, mapping)
+            name = args.name or default_name(mapping.name)
+            robot = Robot(
+                opened.rig,
+                args.map,
+                directory=args.state or Path(f"cairn-{name}"),
+                name=name,
+                token=args.token.of(args.map),
+                mode=args.mode,
+                geometry=ensure_map(args, lambda: _channels(mapping)),
+                integrator=integrator_of(args),
+                scope=scope_of(args, args.mode),
+                limits=limits,
+                link=args.link,
+                stay=args.stay,
+                keep_scans_bytes=kept_bytes,
+            )
+        except CairnError as exc:
+            if source is not None:
+                source.close()
+            sys.stderr.write(f"cairn robot live: {exc.message} [{exc.kind}]\n")
+            return USAGE
+        return _map(args, source, mapping, opened, robot, stopping)
+
+
+def _mapping(args: argparse.Namespace) -> BagMapping:
+    """The mapping of the topics: that of the file, else the proposed one if it leaves no question open."""
+    if args.topics is not None:
+        return mapping_of(args.topics)
+    source = FoxgloveSource(args.source)
+    try:
+        proposal = survey_live(source, seconds=SURVEY_S, on_message=lambda: None).proposal
+    finally:
+        source.close()
+    if proposal.questions:
+        raise BadInputError(
+            "undecided",
+            f"{args.source} leaves something to decide: {'; '.join(proposal.questions)}. Write a file by `cairn robot "
+            f"inspect {args.source} --output live.yaml`, edit it, and give it with --topics live.yaml",
+        )
+    return mapping_from_yaml(proposal.text, f"the topics proposed for {args.source}")
+
+
+def _channels(mapping: BagMapping) -> tuple[Channel, ...]:
+    """Channels that the cameras of a mapping can fill."""
+    spectra = {camera.spectrum for camera in mapping.cameras.values()}
+    has_amplitude = any(camera.amplitude is not None for camera in mapping.cameras.values())
+    has = (
+        (COLOUR, Spectrum.COLOUR in spectra),
+        (INTENSITY, has_amplitude),
+        (TEMPERATURE, Spectrum.THERMAL in spectra),
+    )
+    return tuple(channel for channel, found in has if found)
+
+
+def _map(
+    args: argparse.Namespace,
+    source: FoxgloveSource,
+    mapping: BagMapping,
+    opened: OpenedLive,
+    robot: Robot,
+    stopping: Stopping,
+) -> int:
+    """Map until a signal comes."""
+    decoder = ScanDecoder(args.source, mapping, opened.rig, opened.topics)
+    live = LiveMapping(
+        robot,
+        opened.scans,
+        decoder,
+        gate_of(args, is_standard=True),
+        profile=Profile(args.profile) if args.profile else None,
+    )
+    watch = StatusWatch(robot.name, source, opened.scans, live, opened.topics, time.monotonic())
+    shown = _ShownStatus(watch, robot, as_json=args.json)
+    try:
+        with lines_on_stderr(robot.events()):
+            robot.start_sync(every_s=args.every)
+            live.step(opened.early)
+            while not stopping.is_set():
+                live.step(source.take(within_s=0.0 if live.is_behind else TAKE_S))
+                watch.note_lead(time.time())
+                shown.show_if_due()
+            source.close()
+            live.step(source.take(within_s=0.0))
+            live.finish()
+            last = shown.show_last()
+            robot.close(flush_s=FLUSH_S)
+    finally:
+        source.close()
+        robot.close(flush_s=FLUSH_S)
+    if not args.json:
+        causes = {"not moved": live.not_moved, "dropped": live.dropped, **last.left_out}
+        left = "".join(f"; {count} {cause}" for cause, count in causes.items() if count)
+        say(
+            f"mapped {live.taken} scans of {last.arrived} as {live.commits} commits{left}; {robot.waiting} commits wait"
+        )
+        say(returns_line(robot.returns))
+    return 0
+
+
+class _ShownStatus:
+    """Status as it is written: JSON to standard output, or a line to standard error that a terminal replaces."""
+
+    def __init__(self, watch: StatusWatch, robot: Robot, *, as_json: bool) -> None:
+        self._watch = watch
+        self._robot = robot
+        self._as_json = as_json
+        self._line = StatusLine()
+        is_terminal = self._line.is_terminal
+        self._every_s = JSON_EVERY_S if as_json else TERMINAL_EVERY_S if is_terminal else LOG_EVERY_S
+        self._next_s = time.monotonic() + min(self._every_s, JSON_EVERY_S)
+
+    def show_if_due(self) -> None:
+        """Write the status, unless the last one is too recent."""
+        if time.monotonic() >= self._next_s:
+            self.show()
+
+    def show_last(self) -> LiveStatus:
+        """Write the status, and make room on a terminal for what follows."""
+        status = self.show()
+        if not self._as_json:
+            self._line.clear()
+        return status
+
+    def show(self) -> LiveStatus:
+        """Write the status."""
+        now_s = time.monotonic()
+        self._next_s = now_s + self._every_s
+        status = self._watch.status(now_s, time.time(), commits_waiting=self._robot.waiting)
+        if self._as_json:
+            say(status.model_dump_json())
+            sys.stdout.flush()
+        else:
+            self._line.show(self._watch.line(status))
+        return status

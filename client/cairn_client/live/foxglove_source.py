@@ -1,0 +1,275 @@
+"""Door of a Foxglove bridge: the topics of a live robot and their messages, through reconnects and new channel ids.
+
+    connect -> serverInfo -> advertise -> subscribe -> message, message, ...           one thread, which only receives
+
+Everything goes by the topic's name: a bridge that starts again, or a node that does, gets new channel ids. A
+subscription that is refused because the bridge does not know its own channel yet, or that stays silent, is made again.
+"""
+
+import logging
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from urllib.parse import urlsplit
+
+from websockets.exceptions import InvalidHandshake, InvalidMessage, InvalidURI, WebSocketException
+from websockets.sync.client import ClientConnection, connect
+from websockets.typing import Subprotocol
+
+from cairn_client.live.foxglove_frames import (
+    SUBPROTOCOLS,
+    Advertised,
+    BridgeInfo,
+    MessageData,
+    ServerError,
+    Withdrawn,
+    read_frame,
+    subscribe_text,
+    unsubscribe_text,
+)
+from cairn_client.live.inbox import Inbox
+from cairn_fusion.ros.bag import BagMessage, Topic
+from cairn_map.errors import BadInputError, DamagedDataError
+
+log = logging.getLogger(__name__)
+
+MESSAGE_BYTES_MAX = 256 << 20
+FRAMES_MAX = 16
+"""Frames that the library reads ahead; beyond them the bridge drops the oldest without a word."""
+CONNECT_S = 2.5
+"""Longest wait for the bridge's answer."""
+LOOK_S = 0.1
+"""Longest wait for a frame before subscriptions are looked after."""
+AGAIN_S = (0.2, 0.5, 1.0, 2.0, 5.0)
+"""Pauses before a link is tried again; the last one repeats."""
+REFUSED_AGAIN_S = 0.2
+SILENT_AGAIN_S = 3.0
+"""Pause after which a topic that brought nothing is subscribed again; doubled each time, up to a minute."""
+SILENT_AGAIN_MAX_S = 60.0
+BRIDGE_HELP = (
+    "start one on the robot: sudo apt install ros-$ROS_DISTRO-foxglove-bridge; "
+    "ros2 launch foxglove_bridge foxglove_bridge_launch.xml"
+)
+
+
+@dataclass(slots=True)
+class _Subscription:
+    """Subscription of one topic on the present link."""
+
+    channel: int
+    number: int
+    again_s: float
+    """Steady time at which it is made again, if nothing came by it."""
+    pause_s: float = SILENT_AGAIN_S
+    messages: int = 0
+
+
+class FoxgloveSource:
+    """Live source behind one URL; its messages are taken by one thread."""
+
+    def __init__(self, url: str, *, inbox: Inbox | None = None, steady_s: Callable[[], float] = time.monotonic) -> None:
+        """Args: url: ws://HOST:PORT.
+
+        Raises:
+            BadInputError: kind `bad_url`: it is none.
+        """
+        parts = urlsplit(url)
+        if parts.scheme != "ws" or not parts.hostname:
+            raise BadInputError(
+                "bad_url", f"a live source is the URL of a Foxglove bridge, ws://HOST:PORT; got {url!r}"
+            )
+        self.url = url
+        self.links = 0
+        """Times that a link was made."""
+        self.damaged = 0
+        """Frames that were none of the protocol."""
+        self.lost_since_s: float | None = None
+        """Steady time since which there is no link; None: there is one."""
+        self._inbox = inbox or Inbox()
+        self._steady_s = steady_s
+        self._lock = threading.Lock()
+        self._wanted: Callable[[Topic], bool] = lambda topic: False
+        self._channels: dict[int, Topic] = {}
+        self._counts: Counter[str] = Counter()
+        self._subscriptions: dict[str, _Subscription] = {}
+        self._by_number: dict[int, str] = {}
+        self._numbers = 0
+        self._last_ns = 0
+        self._closing = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    @property
+    def topics(self) -> dict[str, Topic]:
+        """Topics that are offered now, by name."""
+        with self._lock:
+            return {topic.name: topic for topic in self._channels.values()}
+
+    @property
+    def counts(self) -> Counter[str]:
+        """Messages that came, by topic."""
+        with self._lock:
+            return self._counts.copy()
+
+    @property
+    def dropped(self) -> Counter[str]:
+        """Messages that went for room here, by topic."""
+        return self._inbox.dropped
+
+    def open(self, wanted: Callable[[Topic], bool]) -> None:
+        """Connect, and receive from here on, in a thread of its own.
+
+        Args:
+            wanted: True of the topics whose messages are wanted; asked about each that is offered, whenever it is.
+
+        Raises:
+            BadInputError: kind `no_bridge`: nothing answers there; kind `no_foxglove`: something else does.
+        """
+        self._wanted = wanted
+        stack = ExitStack()
+        link = self._connect(stack)
+        self._thread = threading.Thread(target=self._receive, args=(stack, link), name="cairn-live", daemon=True)
+        self._thread.start()
+
+    def take(self, *, within_s: float) -> list[BagMessage]:
+        """All messages that wait, as soon as there are any."""
+        return self._inbox.take(within_s=within_s)
+
+    def close(self) -> None:
+        """End the link; what waits may still be taken."""
+        self._closing.set()
+        self._inbox.close()
+        if self._thread is not None:
+            self._thread.join(CONNECT_S + 1)
+
+    def _connect(self, stack: ExitStack) -> ClientConnection:
+        """A link that is closed with the stack."""
+        try:
+            link = stack.enter_context(
+                connect(
+                    self.url,
+                    subprotocols=[Subprotocol(name) for name in SUBPROTOCOLS],
+                    compression=None,
+                    max_size=MESSAGE_BYTES_MAX,
+                    max_queue=FRAMES_MAX,
+                    open_timeout=CONNECT_S,
+                    close_timeout=1,
+                    proxy=None,
+                )
+            )
+        except (InvalidHandshake, InvalidMessage) as exc:
+            raise BadInputError(
+                "no_foxglove", f"{self.url} answers, but is no Foxglove bridge ({exc}); {BRIDGE_HELP}"
+            ) from exc
+        except (OSError, InvalidURI, WebSocketException) as exc:
+            said = str(exc) or type(exc).__name__
+            raise BadInputError(
+                "no_bridge", f"no Foxglove bridge answers at {self.url} ({said}); {BRIDGE_HELP}"
+            ) from exc
+        if link.subprotocol not in SUBPROTOCOLS:
+            stack.close()
+            raise BadInputError(
+                "no_foxglove",
+                f"{self.url} speaks none of {', '.join(SUBPROTOCOLS)} (rosbridge is another program); {BRIDGE_HELP}",
+            )
+        return link
+
+    def _receive(self, stack: ExitStack, first: ClientConnection) -> None:
+        """Receive until `close`, over one link after the other."""
+        link: ClientConnection | None = first
+        tries = 0
+        while not self._closing.is_set():
+            with stack:
+                try:
+                    if link is None:
+                        link = self._connect(stack)
+                    tries = 0
+                    self._begin_link()
+                    self._listen(link)
+                except BadInputError as exc:
+                    log.debug("%s", exc.message)
+                except (OSError, WebSocketException) as exc:
+                    log.info("the link to %s is lost: %s", self.url, exc or type(exc).__name__)
+                finally:
+                    self._end_link()
+            link, stack = None, ExitStack()
+            self._closing.wait(AGAIN_S[min(tries, len(AGAIN_S) - 1)])
+            tries += 1
+
+    def _begin_link(self) -> None:
+        self.links += 1
+        self.lost_since_s = None
+
+    def _end_link(self) -> None:
+        if self.lost_since_s is None:
+            self.lost_since_s = self._steady_s()
+        with self._lock:
+            self._channels, self._subscriptions, self._by_number = {}, {}, {}
+
+    def _listen(self, link: ClientConnection) -> None:
+        while not self._closing.is_set():
+            try:
+                frame = link.recv(timeout=LOOK_S)
+            except TimeoutError:
+                frame = None
+            if frame is not None:
+                try:
+                    self._take_frame(link, frame)
+                except DamagedDataError as exc:
+                    self.damaged += 1
+                    log.warning("%s: %s", self.url, exc.message)
+            self._subscribe_again(link)
+
+    def _take_frame(self, link: ClientConnection, frame: str | bytes) -> None:
+        match read_frame(frame):
+            case MessageData(subscription=number, data=data):
+                name = self._by_number.get(number)
+                if name is None:
+                    return
+                self._subscriptions[name].messages += 1
+                with self._lock:
+                    self._counts[name] += 1
+                # The order of a topic's messages is that of their times, whatever the clock does.
+                self._last_ns = max(self._last_ns, time.time_ns())
+                self._inbox.put(BagMessage(name, self._last_ns, data))
+            case Advertised(channels=channels):
+                with self._lock:
+                    self._channels |= channels
+                for channel, topic in channels.items():
+                    if self._wanted(topic):
+                        self._subscribe(link, channel, topic.name)
+            case Withdrawn(channel_ids=ids):
+                with self._lock:
+                    gone = [self._channels.pop(number, None) for number in ids]
+                for name in {topic.name for topic in gone if topic is not None}:
+                    known = self._subscriptions.get(name)
+                    if known is not None and known.channel in ids:
+                        del self._subscriptions[name], self._by_number[known.number]
+            case ServerError(message=message):
+                log.info("%s says: %s", self.url, message)
+                soon_s = self._steady_s() + REFUSED_AGAIN_S
+                for subscription in self._subscriptions.values():
+                    if not subscription.messages:
+                        subscription.again_s = min(subscription.again_s, soon_s)
+            case BridgeInfo(name=name):
+                log.info("%s is %s", self.url, name)
+
+    def _subscribe(self, link: ClientConnection, channel: int, name: str, *, pause_s: float = SILENT_AGAIN_S) -> None:
+        """Subscribe to a topic, in the place of the subscription that it has."""
+        before = self._subscriptions.pop(name, None)
+        if before is not None:
+            del self._by_number[before.number]
+            link.send(unsubscribe_text([before.number]))
+        self._numbers += 1
+        self._subscriptions[name] = _Subscription(channel, self._numbers, self._steady_s() + pause_s, pause_s)
+        self._by_number[self._numbers] = name
+        link.send(subscribe_text([(self._numbers, channel)]))
+
+    def _subscribe_again(self, link: ClientConnection) -> None:
+        now_s = self._steady_s()
+        for name, subscription in list(self._subscriptions.items()):
+            if not subscription.messages and now_s >= subscription.again_s:
+                pause_s = min(2 * subscription.pause_s, SILENT_AGAIN_MAX_S)
+                self._subscribe(link, subscription.channel, name, pause_s=pause_s)

@@ -1,0 +1,129 @@
+"""Live mapping: scans of a live source into a robot, one after the other, by the thread that calls it.
+
+    messages -> LiveScans -> backlog -> gate -> decode -> Robot.observe -> commit after 50 scans, 5 s or 2 m
+
+A robot that is slower than its cameras takes the newest scans: those that wait longer than a second go, and are
+counted. So arrived = taken + not moved + dropped + left out by cause + waiting, at any time.
+"""
+
+import logging
+import time
+from collections import deque
+from collections.abc import Callable, Iterable
+
+from cairn_client.robot.robot import Robot
+from cairn_fusion.mapping.grouping import Grouping, OpenGroup
+from cairn_fusion.mapping.scan_gate import ScanGate
+from cairn_fusion.ros.bag import BagMessage
+from cairn_fusion.ros.live_scans import Cause, LiveScans, ReadyScan
+from cairn_fusion.ros.scan_decoder import ScanDecoder
+from cairn_map.codec.cell_code import Profile
+from cairn_map.errors import BadInputError, DamagedDataError, UnreachableError
+
+log = logging.getLogger(__name__)
+
+BEHIND_S = 1.0
+"""Wait from which on a scan gives way to newer ones."""
+REST_S = 5.0
+"""Time without a scan after which the open measurement is committed."""
+
+
+class LiveMapping:
+    """Mapping of one live source by one robot."""
+
+    def __init__(
+        self,
+        robot: Robot,
+        scans: LiveScans,
+        decoder: ScanDecoder,
+        gate: ScanGate,
+        *,
+        profile: Profile | None = None,
+        steady_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.taken = 0
+        """Scans that became evidence."""
+        self.dropped = 0
+        """Scans that gave way to newer ones."""
+        self.commits = 0
+        self.refusal = ""
+        """Reason for which the last commit waits; empty: there is none."""
+        self.newest_s = float("-inf")
+        """Stamp of the newest scan taken."""
+        self._robot = robot
+        self._scans = scans
+        self._decoder = decoder
+        self._gate = gate
+        self._profile = profile
+        self._steady_s = steady_s
+        self._group = OpenGroup(Grouping())
+        self._backlog: deque[ReadyScan] = deque()
+        self._last_scan_s: float | None = None
+        """Steady time of the last scan of the open measurement; None: it is empty."""
+
+    @property
+    def not_moved(self) -> int:
+        """Scans that the gate did not take."""
+        return self._gate.kept_out
+
+    @property
+    def is_behind(self) -> bool:
+        """True if scans wait for their turn."""
+        return bool(self._backlog)
+
+    @property
+    def waiting(self) -> int:
+        """Range images and scans that wait."""
+        return self._scans.waiting + len(self._backlog)
+
+    def step(self, messages: Iterable[BagMessage]) -> None:
+        """Take new messages, and map one scan at most.
+
+        Raises:
+            BadInputError: kind `frames_moved`: a frame that carries cameras moves.
+        """
+        now_s = self._steady_s()
+        for message in messages:
+            self._scans.add(message, now_s)
+        self._backlog.extend(self._scans.ready(now_s))
+        while len(self._backlog) > 1 and now_s - self._backlog[0].arrived_s > BEHIND_S:
+            self._backlog.popleft()
+            self.dropped += 1
+        if self._backlog:
+            self._map(self._backlog.popleft())
+        elif self._last_scan_s is not None and now_s - self._last_scan_s > REST_S:
+            self._commit()
+
+    def finish(self) -> None:
+        """Map all that waits, and commit; no more messages come."""
+        for ready in (*self._backlog, *self._scans.ready(self._steady_s(), is_over=True)):
+            self._map(ready)
+        self._backlog.clear()
+        self._commit()
+
+    def _map(self, ready: ReadyScan) -> None:
+        found = ready.found
+        if not self._gate.takes(found.camera, found.time_s, found.T_map_rig):
+            return
+        try:
+            scan = self._decoder.decode(found, ready.messages.__getitem__, ready.pose_at)
+            if self._group.ends_before(scan.time_s, scan.T_map_rig):
+                self._commit()
+            self.commits += self._robot.observe(scan) is not None
+        except (BadInputError, DamagedDataError) as exc:
+            log.warning("a scan of %s at %.3f s is left out: %s", found.camera, found.time_s, exc.message)
+            self._scans.left_out[Cause.DAMAGED] += 1
+            return
+        self.taken += 1
+        self.newest_s = max(self.newest_s, scan.time_s)
+        self._last_scan_s = self._steady_s()
+
+    def _commit(self) -> None:
+        """Commit the open measurement; where the disk or the outbox is full it stays open, and is tried again."""
+        try:
+            self.commits += self._robot.commit(profile=self._profile) is not None
+            self.refusal, self._last_scan_s = "", None
+        except UnreachableError as exc:
+            if not self.refusal:
+                log.error("%s; mapping goes on in the open measurement", exc.message)
+            self.refusal, self._last_scan_s = exc.message, self._steady_s()

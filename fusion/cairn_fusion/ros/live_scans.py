@@ -1,0 +1,306 @@
+"""Scans of a live robot: messages in, in any order, and the scans out that a replay of the same messages would find.
+
+    range image at t   waits for   a pose at or after t on every moving edge      else: no tf, tf late, gap in tf
+                                   images of other cameras later than t + tolerance     else: without them
+                                   at most `max_wait_s`
+
+The choice itself is a bag's (`bag_scans`): of every other camera the nearest image within the tolerance, and the pose
+interpolated between its neighbours, never extrapolated. What does not become a scan is counted by its cause.
+"""
+
+from bisect import bisect_left
+from collections import Counter, deque
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import numpy as np
+
+from cairn_calib.rig.rig import Spectrum
+from cairn_fusion.recording.timed_lists import TimedList
+from cairn_fusion.ros.bag import BagMessage, Topic
+from cairn_fusion.ros.bag_index import BASE, STATIC_NAME, BagIndex, TopicIndex, translate_message_damage, wire_of
+from cairn_fusion.ros.bag_scans import BagScan, PoseAt, images_near, poses_of
+from cairn_fusion.ros.live_frames import WINDOW_S, LiveFrames
+from cairn_fusion.ros.messages import ODOMETRY, POSES, TRANSFORMS, RosTransform, read_header, read_pose, read_transforms
+from cairn_fusion.ros.scan_decoder import is_loose
+from cairn_fusion.ros.topic_mapping import BagMapping, MappedCamera
+from cairn_map.errors import BadInputError, DamagedDataError
+
+MAX_WAIT_S = 0.5
+SWEEP_S = 0.25
+"""Time before and after a cloud's stamp from which its points may be."""
+SEEN_MAX = 4096
+"""Stamps of one camera that are remembered, so that no image becomes a scan twice."""
+IMAGE_BYTES_MAX = 256_000_000
+"""Most bytes of images that wait for a decision; beyond it the oldest go."""
+OTHERS_S = 2.0
+"""Age at which an image that no range image needed is forgotten, behind the newest of its topic."""
+
+
+class Cause(StrEnum):
+    """Cause for which a range image becomes no scan."""
+
+    NO_TF = "no tf"
+    """No way leads from the base to the map's frame, or none did yet at its time."""
+    TF_LATE = "tf late"
+    """No pose at or after its time came within the wait."""
+    TF_GAP = "gap in tf"
+    """The poses before and after it are too far apart."""
+    DAMAGED = "damaged"
+    AGAIN = "sent twice"
+    NO_ROOM = "no room"
+    """Dropped, oldest first, for the bytes of images that may wait."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReadyScan:
+    """One scan, its images not yet decoded."""
+
+    found: BagScan
+    messages: Mapping[str, BagMessage]
+    pose_at: PoseAt
+    """Way of the robot around the scan."""
+    arrived_s: float
+
+
+@dataclass(slots=True)
+class _Images:
+    """Images of one topic in order of their stamps."""
+
+    times_s: list[float] = field(default_factory=list)
+    messages: list[BagMessage] = field(default_factory=list)
+
+    def add(self, time_s: float, message: BagMessage) -> bool:
+        """Add an image; False if there is one of that stamp. Those of a clock that was set back begin again."""
+        if self.times_s and time_s < self.times_s[-1] - WINDOW_S:
+            self.times_s, self.messages = [], []
+        at = bisect_left(self.times_s, time_s)
+        if at < len(self.times_s) and self.times_s[at] == time_s:
+            return False
+        self.times_s.insert(at, time_s)
+        self.messages.insert(at, message)
+        return True
+
+    def forget_before(self, time_s: float) -> None:
+        """Drop the images before a time."""
+        old = bisect_left(self.times_s, time_s)
+        del self.times_s[:old], self.messages[:old]
+
+    def timed(self) -> TimedList[int]:
+        """Numbers of the images by time."""
+        return TimedList(np.array(self.times_s, np.float64), tuple(range(len(self.times_s))))
+
+    @property
+    def size_bytes(self) -> int:
+        """Bytes of all images."""
+        return sum(len(message.data) for message in self.messages)
+
+
+@dataclass(frozen=True, slots=True)
+class _Pending:
+    """Range image that waits for its pose and for other images."""
+
+    camera: str
+    time_s: float
+    arrived_s: float
+
+
+class LiveScans:
+    """Assembler of one robot's scans; by one thread."""
+
+    def __init__(
+        self,
+        source: str,
+        mapping: BagMapping,
+        topics: Mapping[str, Topic],
+        *,
+        max_wait_s: float = MAX_WAIT_S,
+        image_bytes_max: int = IMAGE_BYTES_MAX,
+    ) -> None:
+        """Args: source: name of the robot in errors; topics: those of the mapping, and all transforms."""
+        self.frames = LiveFrames(source)
+        self.arrived: Counter[str] = Counter()
+        """Range images that came, by camera."""
+        self.left_out: Counter[Cause] = Counter()
+        """Range images that became no scan, by cause."""
+        self.alone = 0
+        """Scans that lack an image of another camera."""
+        self.damaged = 0
+        """Messages of any topic that could not be read."""
+        self.frame_error = ""
+        """Newest reason for which a transform was not taken, or no way leads to the map; empty: there is none."""
+        self.newest_s = -np.inf
+        """Newest stamp of a range image."""
+        self._source = source
+        self._mapping = mapping
+        self._topics = dict(topics)
+        self._max_wait_s = max_wait_s
+        self._image_bytes_max = image_bytes_max
+        self._track = LiveFrames(f"{source}: {mapping.poses.topic}")
+        self._ranges = {c.topic: name for name, c in mapping.cameras.items() if c.spectrum is Spectrum.RANGE}
+        amplitudes = {c.amplitude for c in mapping.cameras.values() if c.amplitude is not None}
+        self._images = {topic: _Images() for topic in {c.topic for c in mapping.cameras.values()} | amplitudes}
+        self._pending: list[_Pending] = []
+        self._seen: dict[str, deque[float]] = {topic: deque(maxlen=SEEN_MAX) for topic in self._ranges}
+
+    @property
+    def waiting(self) -> int:
+        """Range images that wait for their pose, or for other images."""
+        return len(self._pending)
+
+    def add(self, message: BagMessage, now_s: float) -> None:
+        """Add a message of one of the topics; one that cannot be read is counted.
+
+        Args:
+            message: as it came.
+            now_s: steady seconds.
+
+        Raises:
+            BadInputError: kind `frames_moved`: a frame that carries cameras moves.
+        """
+        topic = self._topics.get(message.topic)
+        if topic is None:
+            return
+        try:
+            # Numbers of strangers may be as large as they like: what overflows is refused by its size.
+            with translate_message_damage(self._source, message), np.errstate(all="ignore"):
+                self._add(message, topic, now_s)
+        except DamagedDataError:
+            self.damaged += 1
+            if message.topic in self._ranges:
+                self.arrived[self._ranges[message.topic]] += 1
+                self.left_out[Cause.DAMAGED] += 1
+
+    def _add(self, message: BagMessage, topic: Topic, now_s: float) -> None:
+        wire = wire_of(topic)
+        if topic.type in TRANSFORMS:
+            for edge in read_transforms(message.data, wire):
+                self._add_pose(self.frames, edge, is_static=STATIC_NAME in topic.name)
+        elif topic.name == self._mapping.poses.topic and (topic.type == ODOMETRY or topic.type in POSES):
+            pose = read_pose(message.data, wire, type_name=topic.type)
+            named = RosTransform(pose.time_s, pose.parent or "map", pose.child or BASE, pose.pose)
+            if self._track.edges and named.child not in self._track.edges:
+                self.frame_error = f"{topic.name} has poses of {named.child} and of {next(iter(self._track.edges))}"
+                return
+            self._add_pose(self._track, named, is_static=False)
+        elif topic.name in self._images:
+            self._add_image(message, topic, read_header(message.data, wire).time_s, now_s)
+
+    def _add_pose(self, frames: LiveFrames, found: RosTransform, *, is_static: bool) -> None:
+        try:
+            frames.add(found, is_static=is_static)
+        except BadInputError as exc:
+            if exc.kind == "frames_moved":
+                raise
+            self.frame_error = exc.message
+
+    def _add_image(self, message: BagMessage, topic: Topic, time_s: float, now_s: float) -> None:
+        camera = self._ranges.get(topic.name)
+        if camera is not None:
+            self.arrived[camera] += 1
+            self.newest_s = max(self.newest_s, time_s)
+            if time_s in self._seen[topic.name]:
+                self.left_out[Cause.AGAIN] += 1
+                return
+            self._seen[topic.name].append(time_s)
+            self._pending.append(_Pending(camera, time_s, now_s))
+        images = self._images[topic.name]
+        images.add(time_s, message)
+        self._keep_bounds(images)
+
+    def _keep_bounds(self, images: _Images) -> None:
+        """Forget images that no range image can need any more, and the oldest beyond the bytes that may wait."""
+        needed_s = min((pending.time_s for pending in self._pending), default=np.inf)
+        images.forget_before(min(needed_s - self._mapping.time_tolerance_s, images.times_s[-1] - OTHERS_S))
+        while sum(one.size_bytes for one in self._images.values()) > self._image_bytes_max and len(self._pending) > 1:
+            oldest = min(self._pending, key=lambda pending: pending.arrived_s)
+            self._forget(oldest)
+            self.left_out[Cause.NO_ROOM] += 1
+            for one in self._images.values():
+                one.forget_before(min(pending.time_s for pending in self._pending) - self._mapping.time_tolerance_s)
+
+    def ready(self, now_s: float, *, is_over: bool = False) -> Iterator[ReadyScan]:
+        """Scans that are complete, in order of time; those that waited too long are taken as they are, or left out.
+
+        Args:
+            now_s: steady seconds.
+            is_over: no more messages come.
+        """
+        for pending in sorted(self._pending, key=lambda pending: pending.time_s):
+            camera = self._mapping.cameras[pending.camera]
+            is_overdue = is_over or now_s - pending.arrived_s >= self._max_wait_s
+            if not is_overdue and not self._has_others(camera, pending.time_s):
+                continue
+            way = self._way(camera, pending.time_s, is_overdue=is_overdue)
+            if way is None:
+                continue
+            self._pending.remove(pending)
+            if isinstance(way, Cause):
+                self.left_out[way] += 1
+            else:
+                yield self._scan(pending, camera, way)
+
+    def _others(self, camera: MappedCamera) -> list[str]:
+        """Topics of the images that go with those of a range camera."""
+        others = [other.topic for other in self._mapping.cameras.values() if other.spectrum is not Spectrum.RANGE]
+        return [*others, *([camera.amplitude] if camera.amplitude else [])]
+
+    def _has_others(self, camera: MappedCamera, time_s: float) -> bool:
+        """True if no later image of another camera can be nearer."""
+        for topic in self._others(camera):
+            images = self._images[topic]
+            if not images.times_s:
+                return False
+            at = bisect_left(images.times_s, time_s)
+            has_same = at < len(images.times_s) and images.times_s[at] == time_s
+            if not has_same and images.times_s[-1] < time_s + self._mapping.time_tolerance_s:
+                return False
+        return True
+
+    def _way(
+        self, camera: MappedCamera, time_s: float, *, is_overdue: bool
+    ) -> tuple[PoseAt, float, float] | Cause | None:
+        """The way of the robot around a time; None: more may come; a cause: it comes too late."""
+        reach_s = SWEEP_S if is_loose(camera) else 0.0
+        span = time_s - reach_s, time_s + reach_s
+        topic = self._topics[self._mapping.poses.topic]
+        index = BagIndex(
+            {topic.name: TopicIndex(topic)}, self.frames.tree(*span), {topic.name: self._track.tree(*span)}
+        )
+        try:
+            if topic.type not in TRANSFORMS and not self._track.edges:
+                return Cause.NO_TF if is_overdue else None
+            pose_at, first_s, last_s = poses_of(index, self._mapping)
+        except BadInputError as exc:
+            self.frame_error = exc.message
+            return Cause.NO_TF if is_overdue else None
+        if not first_s <= time_s <= last_s or (not is_overdue and last_s < span[1]):
+            return (Cause.NO_TF if time_s < first_s else Cause.TF_LATE) if is_overdue else None
+        try:
+            pose_at(time_s)
+        except BadInputError as exc:
+            self.frame_error = exc.message
+            return Cause.TF_GAP if is_overdue else None
+        self.frame_error = ""
+        return pose_at, first_s, last_s
+
+    def _scan(self, pending: _Pending, camera: MappedCamera, way: tuple[PoseAt, float, float]) -> ReadyScan:
+        pose_at, first_s, last_s = way
+        lists = {topic: self._images[topic].timed() for topic in (camera.topic, *self._others(camera))}
+        numbers = images_near(self._mapping, camera, lists, pending.time_s)
+        self.alone += len(numbers) < len(lists)
+        messages = {topic: self._images[topic].messages[n] for topic, n in numbers.items()}
+        self._forget_image(camera.topic, pending.time_s)
+        found = BagScan(time_s=pending.time_s, T_map_rig=pose_at(pending.time_s), camera=pending.camera, images=numbers)
+        return ReadyScan(found, messages, lambda time_s: pose_at(min(max(time_s, first_s), last_s)), pending.arrived_s)
+
+    def _forget(self, pending: _Pending) -> None:
+        self._pending.remove(pending)
+        self._forget_image(self._mapping.cameras[pending.camera].topic, pending.time_s)
+
+    def _forget_image(self, topic: str, time_s: float) -> None:
+        images = self._images[topic]
+        at = bisect_left(images.times_s, time_s)
+        if at < len(images.times_s) and images.times_s[at] == time_s:
+            del images.times_s[at], images.messages[at]

@@ -1,0 +1,358 @@
+"""A live robot through its Foxglove bridge: its map is that of a replay of the same messages, through restarts."""
+
+import json
+import signal
+import subprocess
+import sys
+import threading
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from tests.fixtures.client.bridge import Bridge, a_bridge
+from tests.fixtures.client.live_server import LiveServer, wait_until
+from tests.fixtures.fusion.bags import ROS2, Messages, Timed, write_bag
+from tests.fixtures.fusion.drive_mapping import mapping_text
+from tests.fixtures.fusion.live_drive import drive, in_bag_order, latched
+from websockets.sync.server import ServerConnection, serve
+
+from cairn_client import main as cairn
+from cairn_client.live.foxglove_source import FoxgloveSource
+from cairn_client.live.live_mapping import LiveMapping
+from cairn_client.live.live_opening import open_live
+from cairn_client.robot.robot import Robot
+from cairn_fusion.mapping.scan_gate import GateBounds, ScanGate
+from cairn_fusion.ros.scan_decoder import ScanDecoder
+from cairn_fusion.ros.topic_mapping import mapping_from_yaml
+from cairn_map.errors import BadInputError
+from cairn_map.evidence.channels import COLOUR, TEMPERATURE
+from cairn_map.evidence.grid import geometry_for
+
+MAKE = Messages(ROS2)
+NOWHERE = "http://127.0.0.1:9/maps/lab"
+VOXEL_M = 0.05
+GRID = geometry_for(voxel_edge_m=VOXEL_M, channels=(COLOUR, TEMPERATURE))
+MAPPING = mapping_from_yaml(mapping_text(), "drive")
+TOPICS = ("/tf", "/tf_static", "/depth/image", "/depth/info", "/colour/image", "/colour/info", "/warm/image")
+
+
+@pytest.fixture
+def bridge() -> Iterator[Bridge]:
+    with a_bridge() as bridge:
+        yield bridge
+
+
+class LiveRun:
+    """A live robot in this thread, which takes what the bridge has sent."""
+
+    def __init__(self, bridge: Bridge, folder: Path, timed: Sequence[Timed], gate: ScanGate) -> None:
+        self.bridge = bridge
+        self.source = FoxgloveSource(bridge.url)
+        opening = threading.Thread(target=self._begin, args=(timed,))
+        opening.start()
+        opened = open_live(self.source, MAPPING)
+        opening.join()
+        self.scans = opened.scans
+        self.robot = Robot(opened.rig, NOWHERE, directory=folder, name="live", geometry=GRID, stay=True)
+        decoder = ScanDecoder("drive", MAPPING, opened.rig, opened.topics)
+        # A clock that stands still: no scan waits too long, however slow the machine is.
+        self.live = LiveMapping(self.robot, self.scans, decoder, gate, steady_s=lambda: 0.0)
+        self.live.step(opened.early)
+
+    def _begin(self, timed: Sequence[Timed]) -> None:
+        """Send what a rig is built from, once all is subscribed."""
+        self.bridge.wait_for(*TOPICS)
+        self.bridge.latch(latched(MAKE))
+        for topic in TOPICS[2:]:
+            self.bridge.send(next(entry for entry in timed if entry[1] == topic))
+
+    def take_until(self, is_done: Callable[[], bool]) -> None:
+        def step() -> bool:
+            self.live.step(self.source.take(within_s=0.01))
+            return is_done()
+
+        wait_until(step)
+
+    def finish(self) -> str:
+        """End; the digest of the map."""
+        self.source.close()
+        self.live.step(self.source.take(within_s=0.0))
+        self.live.finish()
+        digest = self.robot.map.digest()
+        self.robot.close()
+        return digest
+
+
+def replay_digest(folder: Path, timed: Sequence[Timed], *options: str) -> str:
+    """Digest of the map of a replay of these messages as a bag."""
+    bag = write_bag(folder / "drive", "mcap", lambda make: in_bag_order(timed))
+    (folder / "drive.yaml").write_text(mapping_text())
+    command = ("robot", "replay", str(bag), "--topics", str(folder / "drive.yaml"), "--map", NOWHERE)
+    state = ("--state", str(folder / "replay"), "--name", "replay", "--voxel", str(VOXEL_M))
+    assert cairn.main([*command, *state, *options]) == 0
+    with Robot(None, NOWHERE, directory=folder / "replay", name="replay", stay=True) as robot:
+        return robot.map.digest()
+
+
+def send_all(run: LiveRun, timed: Sequence[Timed]) -> None:
+    """Send a drive, some seconds of it at a time, and take it: the bridge keeps no more for a slow reader."""
+    for start in range(0, len(timed), 500):
+        part = timed[start : start + 500]
+        due = run.source.counts + Counter(topic for _, topic, _ in part)
+        for entry in part:
+            run.bridge.send(entry)
+        run.take_until(lambda due=due: due <= run.source.counts and not run.live.is_behind)  # type: ignore[misc]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("bounds", [None, GateBounds()])
+def test_200_scans_through_the_door_are_the_map_of_their_replay(
+    bounds: GateBounds | None, bridge: Bridge, tmp_path: Path
+) -> None:
+    timed = drive(MAKE, scans=200)
+    bridge.offer_all(timed)
+    run = LiveRun(bridge, tmp_path / "live", timed, ScanGate(bounds))
+    # The messages that opened it were sent once already.
+    first = [next(entry for entry in timed if entry[1] == topic) for topic in TOPICS[1:]]
+    send_all(run, [entry for entry in timed if not any(entry is one for one in first)])
+    digest = run.finish()
+    options = ["--every-scan"] if bounds is None else ["--scan-every-m", "0.05"]
+    assert digest == replay_digest(tmp_path, timed, *options)
+    left = sum(run.scans.left_out.values())
+    assert run.live.taken + run.live.not_moved + left == 200 and run.live.dropped == 0
+    assert (run.live.not_moved == 0) is (bounds is None)
+
+
+@pytest.mark.slow
+def test_a_bridge_that_starts_again_is_found_again_and_no_scan_comes_twice(bridge: Bridge, tmp_path: Path) -> None:
+    timed = drive(MAKE, scans=60)
+    bridge.offer_all(timed)
+    run = LiveRun(bridge, tmp_path / "live", timed, ScanGate(None))
+    third = len(timed) // 3
+    parts = timed[1:third], timed[third - 60 : 2 * third], timed[2 * third :]
+    for part, topics in zip(parts, (TOPICS, TOPICS[::-1], TOPICS), strict=True):
+        send_all(run, part)
+        bridge.stop()
+        run.take_until(lambda: run.source.lost_since_s is not None)
+        bridge.start()
+        kinds = {topic: message.__msgtype__ for _, topic, message in timed}
+        for topic in topics:  # under other ids
+            bridge.offer(topic, kinds[topic])
+        bridge.latch(latched(MAKE))
+        run.take_until(lambda: run.source.lost_since_s is None and all(bridge.subscribed[topic] for topic in TOPICS))
+    assert run.source.links == 4
+    assert run.finish() == replay_digest(tmp_path, timed, "--every-scan")
+
+
+def test_a_topic_that_is_offered_again_under_another_id_goes_on(bridge: Bridge) -> None:
+    timed = drive(MAKE, scans=3)
+    bridge.offer_all(timed)
+    source = FoxgloveSource(bridge.url)
+    source.open(lambda topic: topic.name == "/depth/image")
+    try:
+        bridge.wait_for("/depth/image")
+        images = [entry for entry in timed if entry[1] == "/depth/image"]
+        bridge.send(images[0])
+        wait_until(lambda: source.counts["/depth/image"] == 1)
+        bridge.subscribed.clear()
+        bridge.offer("/depth/image", "sensor_msgs/msg/Image")
+        bridge.wait_for("/depth/image")
+        bridge.send(images[1])
+        wait_until(lambda: source.counts["/depth/image"] == 2)
+    finally:
+        source.close()
+
+
+# A stand-in where the SDK's server does no wrong
+
+
+@contextmanager
+def scripted(handle: Callable[[ServerConnection], None], *, subprotocols: Sequence[str] = ()) -> Iterator[str]:
+    """A server of WebSockets; its URL."""
+    with serve(handle, "127.0.0.1", 0, subprotocols=list(subprotocols) or None) as server:  # type: ignore[arg-type]
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            yield f"ws://127.0.0.1:{server.socket.getsockname()[1]}"
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+def test_a_subscription_that_is_refused_right_after_the_advertisement_is_made_again() -> None:
+    asked: list[dict[str, object]] = []
+
+    def handle(link: ServerConnection) -> None:
+        channel = {"id": 1, "topic": "/tf", "encoding": "cdr", "schemaName": "tf2_msgs/msg/TFMessage", "schema": ""}
+        link.send(json.dumps({"op": "serverInfo", "name": "bridge", "capabilities": []}))
+        link.send(json.dumps({"op": "advertise", "channels": [channel]}))
+        for text in link:
+            asked.append(json.loads(text))
+            subscriptions = [a for a in asked if a["op"] == "subscribe"]
+            if len(subscriptions) == 1 and asked[-1]["op"] == "subscribe":
+                link.send(json.dumps({"op": "status", "level": 2, "message": "Unknown channel ID: 1"}))
+            elif asked[-1]["op"] == "subscribe":
+                number = asked[-1]["subscriptions"][0]["id"]  # type: ignore[index]
+                link.send(b"\x01" + number.to_bytes(4, "little") + bytes(8) + b"tf")
+
+    with scripted(handle, subprotocols=["foxglove.websocket.v1"]) as url:
+        source = FoxgloveSource(url)
+        source.open(lambda topic: True)
+        try:
+            wait_until(lambda: source.counts["/tf"] == 1)
+        finally:
+            source.close()
+    ids = [a["subscriptions"][0]["id"] for a in asked if a["op"] == "subscribe"]  # type: ignore[index]
+    assert len(ids) == len(set(ids)) == 2
+
+
+# Bad input: one sentence, exit code 2, nothing mapped
+
+
+def refused(
+    capsys: pytest.CaptureFixture[str], folder: Path, url: str, *options: str, topics: str | None = None
+) -> str:
+    """The sentence of a live robot that does not begin."""
+    path = folder / "live.yaml"
+    path.write_text(mapping_text() if topics is None else topics)
+    capsys.readouterr()
+    command = ["robot", "live", url, "--topics", str(path), "--name", "mole", "--state", str(folder / "mole")]
+    command += [] if "--map" in options else ["--map", NOWHERE]
+    assert cairn.main([*command, "--voxel", str(VOXEL_M), *options]) == 2
+    assert not (folder / "mole").exists()
+    said = capsys.readouterr().err.strip()
+    assert "\n" not in said
+    return said
+
+
+def test_no_bridge_and_what_is_none_are_told_apart(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    said = refused(capsys, tmp_path, "ws://127.0.0.1:9")
+    assert "no Foxglove bridge answers at ws://127.0.0.1:9" in said and "ros2 launch foxglove_bridge" in said
+    with scripted(lambda link: None) as url:  # as rosbridge: no subprotocol
+        assert "speaks none of foxglove.sdk.v1" in refused(capsys, tmp_path, url)
+    assert "ws://HOST:PORT" in refused(capsys, tmp_path, "zenoh://127.0.0.1:7447")
+
+
+def test_a_server_of_http_is_no_bridge(server: LiveServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "answers, but is no Foxglove bridge" in refused(capsys, tmp_path, server.url.replace("http", "ws"))
+
+
+def test_topics_that_are_missing_silent_or_of_another_type_are_named(
+    bridge: Bridge, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cairn_client.cli.robots.live_run.open_live", lambda s, m: open_live(s, m, within_s=2.0))
+    timed = drive(MAKE, scans=3)
+    bridge.offer_all(entry for entry in timed if entry[1] != "/warm/image")
+    said = refused(capsys, tmp_path, bridge.url)
+    assert "offers no topic /warm/image (images of camera warm); it offers /colour/image" in said
+    bridge.offer("/warm/image", "std_msgs/msg/String")
+    assert "/warm/image of ws:" in (said := refused(capsys, tmp_path, bridge.url))
+    assert "holds std_msgs/String; sensor_msgs/Image or" in said
+    bridge.offer("/warm/image", "sensor_msgs/msg/Image", encoding="json")
+    assert "coded neither as ROS 1 nor CDR" in refused(capsys, tmp_path, bridge.url)
+    bridge.offer("/warm/image", "sensor_msgs/msg/Image")
+    said = refused(capsys, tmp_path, bridge.url)
+    assert "a publisher is there, nothing came in 2 s" in said and "/depth/image" in said
+
+
+def test_a_topics_file_with_a_question_is_refused(
+    bridge: Bridge, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    said = refused(capsys, tmp_path, bridge.url, topics="# DECIDE: how many kelvin one count is\n" + mapping_text())
+    assert "how many kelvin one count is" in said and "[undecided]" in said
+
+
+@pytest.mark.slow
+def test_a_map_of_another_grid_is_refused(
+    bridge: Bridge, server: LiveServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    timed = drive(MAKE, scans=3)
+    bridge.offer_all(timed)
+    sender = threading.Thread(target=send_when_subscribed, args=(bridge, timed))
+    sender.start()
+    said = refused(capsys, tmp_path, bridge.url, "--map", server.map_url, "--voxel", "0.03")
+    sender.join()
+    assert "[other_geometry]" in said and "leave --voxel out" in said
+
+
+def send_when_subscribed(bridge: Bridge, timed: Sequence[Timed]) -> None:
+    bridge.wait_for(*TOPICS)
+    for entry in timed:
+        bridge.send(entry)
+
+
+# The command
+
+
+@pytest.mark.slow
+@pytest.mark.processes
+def test_the_command_maps_until_a_signal_and_says_what_came(bridge: Bridge, tmp_path: Path) -> None:
+    timed = drive(MAKE, scans=20)
+    bridge.offer_all(timed)
+    (tmp_path / "live.yaml").write_text(mapping_text())
+    command = [sys.executable, "-m", "cairn_client.main", "robot", "live", bridge.url, "--topics", "live.yaml"]
+    command += [
+        "--map",
+        NOWHERE,
+        "--state",
+        "live",
+        "--name",
+        "live",
+        "--voxel",
+        str(VOXEL_M),
+        "--every-scan",
+        "--json",
+    ]
+    with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as running:
+        assert running.stdout is not None
+        first = next(n for n, entry in enumerate(timed) if entry[1] == "/depth/image") + 6
+        bridge.wait_for(*TOPICS)
+        bridge.latch(latched(MAKE))
+        for entry in timed[:first]:
+            bridge.send(entry)
+        for topic in TOPICS[3:]:
+            bridge.send(next(entry for entry in timed if entry[1] == topic))
+        # The first scan loads the kernels, for which the others would wait too long.
+        statuses = (json.loads(line) for line in running.stdout)
+        assert next(status for status in statuses if status["taken"])["missing"] is not None
+        for entry in timed[first:]:
+            bridge.send(entry)
+        last = next(status for status in statuses if status["arrived"] == 20 and not status["waiting"])
+        running.send_signal(signal.SIGINT)
+        out, err = running.communicate(timeout=60)
+    assert running.returncode == 0, err
+    assert last["taken"] + sum(last["left_out"].values()) + last["dropped"] == 20
+    assert {topic["topic"] for topic in last["topics"]} == set(TOPICS) and last["links"] == 1
+    assert any("clock apart" in text for text in last["missing"])  # the stamps are of 2023
+    assert json.loads(out.splitlines()[-1])["commits"] >= 1
+
+
+@pytest.mark.slow
+def test_inspect_proposes_from_a_live_source_what_live_takes(
+    bridge: Bridge, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    timed = [entry for entry in drive(MAKE, scans=20) if not entry[1].startswith("/warm")]
+    bridge.offer_all(timed)
+    sender = threading.Thread(target=send_when, args=(bridge, timed))
+    sender.start()
+    topics = tmp_path / "live.yaml"
+    assert cairn.main(["robot", "inspect", bridge.url, "--seconds", "2", "--output", str(topics)]) == 0
+    sender.join()
+    out = capsys.readouterr().out
+    assert "/depth/image" in out and "16 x 12" in out and "odom ~> base_link -> depth_frame" in out
+    text = topics.read_text()
+    assert f"cairn robot live {bridge.url} --topics THIS_FILE" in text
+    proposed = mapping_from_yaml(text, topics)
+    assert {name: camera.topic for name, camera in proposed.cameras.items()} == {
+        "depth": "/depth/image", "colour": "/colour/image",
+    }  # fmt: skip
+    with pytest.raises(BadInputError, match="no Foxglove bridge answers"):
+        FoxgloveSource("ws://127.0.0.1:9").open(lambda topic: True)
+
+
+def send_when(bridge: Bridge, timed: Sequence[Timed]) -> None:
+    bridge.wait_for("/tf", "/tf_static", "/depth/image", "/colour/image", "/depth/info", "/colour/info")
+    for entry in timed:
+        bridge.send(entry)

@@ -1,0 +1,118 @@
+"""Live mapping without a door: newest wins on a slow machine, every image is accounted for, and rest is committed."""
+
+from collections.abc import Iterator
+from itertools import groupby
+from pathlib import Path
+
+import pytest
+from tests.fixtures.fusion.bags import ROS2, Messages, write_bag
+from tests.fixtures.fusion.drive_mapping import TOPICS, mapping_text
+from tests.fixtures.fusion.live_drive import bag_message, drive, in_bag_order
+
+from cairn_calib.rig.rig import Rig
+from cairn_client.live.live_mapping import BEHIND_S, REST_S, LiveMapping
+from cairn_client.robot.robot import Robot
+from cairn_fusion.mapping.scan_gate import ScanGate
+from cairn_fusion.ros.bag import BagMessage
+from cairn_fusion.ros.bag_recording import open_bag_recording
+from cairn_fusion.ros.live_scans import Cause, LiveScans
+from cairn_fusion.ros.scan_decoder import ScanDecoder
+from cairn_fusion.ros.topic_mapping import mapping_from_yaml
+from cairn_map.evidence.channels import COLOUR, TEMPERATURE
+from cairn_map.evidence.grid import geometry_for
+
+NOWHERE = "http://127.0.0.1:9/maps/lab"
+GRID = geometry_for(voxel_edge_m=0.05, channels=(COLOUR, TEMPERATURE))
+MAPPING = mapping_from_yaml(mapping_text(), "drive")
+DRIVE = drive(Messages(ROS2), scans=100)
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory: pytest.TempPathFactory) -> Rig:
+    path = write_bag(tmp_path_factory.mktemp("bags") / "drive", "mcap", lambda make: in_bag_order(DRIVE))
+    return open_bag_recording(path, MAPPING).rig
+
+
+class Clock:
+    """Steady seconds that a test sets."""
+
+    def __init__(self) -> None:
+        self.now_s = 0.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+class Driven:
+    """A live robot whose messages and time a test gives."""
+
+    def __init__(self, rig: Rig, folder: Path, gate: ScanGate) -> None:
+        self.clock = Clock()
+        self.scans = LiveScans("drive", MAPPING, TOPICS)
+        self.robot = Robot(rig, NOWHERE, directory=folder, name="mole", geometry=GRID, stay=True)
+        decoder = ScanDecoder("drive", MAPPING, rig, TOPICS)
+        self.live = LiveMapping(self.robot, self.scans, decoder, gate, steady_s=self.clock)
+
+    def step(self, messages: list[BagMessage]) -> None:
+        self.live.step(messages)
+        self.check_account()
+
+    def check_account(self) -> None:
+        """Every range image is somewhere."""
+        live = self.live
+        known = live.taken + live.not_moved + live.dropped + self.scans.left_out.total() + live.waiting
+        assert self.scans.arrived.total() == known
+
+
+@pytest.fixture
+def driven(rig: Rig, tmp_path: Path) -> Iterator[Driven]:
+    found = Driven(rig, tmp_path / "mole", ScanGate(None))
+    yield found
+    found.robot.close()
+
+
+def chunks_of(seconds: float) -> Iterator[list[BagMessage]]:
+    """The drive's messages in order of their stamps, so many seconds of it at a time."""
+    chunk_of = lambda message: int((message.log_ns / 1e9 - DRIVE[0][0]) / seconds)  # noqa: E731
+    for _, messages in groupby(map(bag_message, DRIVE), chunk_of):
+        yield list(messages)
+
+
+def test_a_robot_slower_than_its_cameras_maps_the_newest_and_counts_the_rest(driven: Driven) -> None:
+    ages_s = []
+    for messages in chunks_of(1 / 3):  # one scan in the time of three or four
+        driven.clock.now_s += 1 / 3
+        driven.step(messages)
+        if driven.live.taken:
+            ages_s.append(driven.scans.newest_s - driven.live.newest_s)
+    assert max(ages_s) <= BEHIND_S + 1.0
+    assert driven.live.waiting <= 20
+    driven.live.finish()
+    driven.check_account()
+    assert driven.live.dropped > 50 and driven.live.waiting == 0
+    assert driven.scans.arrived.total() == 100
+
+
+def test_what_cannot_be_decoded_is_left_out_and_counted(driven: Driven) -> None:
+    for entry in DRIVE[:80]:
+        message = bag_message(entry)
+        if message.topic == "/depth/image":
+            message = message._replace(data=bytes(message.data).replace(b"16UC1\0", b"64FC1\0"))
+        driven.step([message])
+    driven.live.finish()
+    driven.check_account()
+    assert driven.live.taken == 0 and driven.scans.left_out[Cause.DAMAGED] > 5
+
+
+def test_a_measurement_is_committed_when_nothing_more_comes(driven: Driven) -> None:
+    for entry in DRIVE[:80]:
+        driven.step([bag_message(entry)])
+    while driven.live.is_behind:
+        driven.step([])
+    assert driven.live.taken > 5 and driven.live.commits == 0
+    driven.clock.now_s += REST_S + 1.0
+    for _ in range(20):  # those that wait for images that never come are first
+        driven.step([])
+    driven.clock.now_s += REST_S + 1.0
+    driven.step([])
+    assert driven.live.commits == 1
