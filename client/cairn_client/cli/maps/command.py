@@ -7,6 +7,8 @@
     $ cairn map info http://127.0.0.1:8750/maps/lab
     $ cairn map get http://127.0.0.1:8750/maps/lab 0,0,0 -o cell.ply
     $ cairn map export http://127.0.0.1:8750/maps/lab --ply lab.ply --picture lab.png --cells lab/
+    $ cairn map export http://127.0.0.1:8750/maps/lab --map-server floor1
+    $ cairn map publish http://127.0.0.1:8750/maps/lab --foxglove 8766
     $ cairn map log http://127.0.0.1:8750/maps/lab --graph
     $ cairn map changes http://127.0.0.1:8750/maps/lab --since 14:05
     $ cairn map branches http://127.0.0.1:8750/maps/lab
@@ -28,6 +30,7 @@ import time
 from pathlib import Path
 
 from cairn_calib.rig.rig import load_rig
+from cairn_client.cli import publish
 from cairn_client.cli.arguments import (
     Subparsers,
     add_map_parser,
@@ -73,6 +76,7 @@ def main(argv: list[str]) -> int:
         changes.add_parser,
         map_export.add_get_parser,
         map_export.add_export_parser,
+        publish.add_parser,
         query.add_parser,
         render.add_parser,
         _add_retract,
