@@ -215,7 +215,7 @@ class _Viewer:
             log.debug("a viewer left")
 
     def _next(self) -> str | bytes | None:
-        """What is to be written next, texts first; None: nothing any more."""
+        """The next text, else the next message; None: nothing comes any more."""
         with self._has_news:
             self._has_news.wait_for(lambda: self._is_stopped or self._texts or self._messages)
             if self._texts:

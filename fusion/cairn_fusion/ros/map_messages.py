@@ -35,7 +35,7 @@ POINT = np.dtype([(name, "<f4") for name in ("x", "y", "z", "rgb", "probability"
 FLOAT32 = 7
 """`PointField.FLOAT32`."""
 SPHERE, TEXT, DELETE_ALL = 2, 9, 3
-"""Of `visualization_msgs/Marker`: two types, and an action."""
+"""Two types and an action of `visualization_msgs/Marker`."""
 ZERO_CELSIUS_K = 273.15
 UNCOLOURED = 0x808080
 """Grey, for voxels that no colour camera saw."""
@@ -130,7 +130,7 @@ def cloud_message(topic: str, voxels: Voxels, frame: str, time_ns: int) -> MapMe
 
 
 def transforms_message(topic: str, poses: dict[str, RobotPose], frame: str, time_ns: int) -> MapMessage:
-    """Where robots are: `T_map_rig` of each, as the frame of its name."""
+    """Poses of robots: `T_map_rig` of each, as the frame of its name."""
     edges = [
         _made(
             "geometry_msgs/msg/TransformStamped",

@@ -39,6 +39,7 @@ def look_down(
             block = U(w | (z & 4))
             hit = (grid.words[U(brick), block, OCCUPIED_BITS] >> shift_of(z)) & LAYER
             known = (grid.words[U(brick), block, KNOWN_BITS] >> shift_of(z)) & LAYER
+            # In the band a hit is an obstacle; below it, under nothing but free voxels, the ground.
             if z >= band_low:
                 occupied |= hit
             else:
@@ -53,12 +54,14 @@ def columns_into(
     grid: Grid, low: Ints, high: Ints, zone_low: int, band_low: int, band_high: int, columns: npt.NDArray[np.int8]
 ) -> None:
     """Write OCCUPIED and FREE into (H, W) columns, of voxels from `low` up to, but without, `high`; others are kept."""
+    # Brick column by brick column, and in it by its four block columns.
     for corner_y in range(low[1] & -8, high[1], 8):
         for corner_x in range(low[0] & -8, high[0], 8):
             for w in range(4):
                 occupied, free = look_down(grid, corner_x, corner_y, w, zone_low, band_low, band_high)
                 if occupied | free == NO_COLUMN:
                     continue
+                # Most block columns of a map's box are unknown; of the others each column is written by itself.
                 for n in range(28):
                     bit = ONE << U(n)
                     if (occupied | free) & bit == NO_COLUMN:
@@ -75,7 +78,7 @@ def columns_in(bits: np.uint64) -> int:
     """Number of the columns of a layer that are set."""
     count = 0
     while bits != NO_COLUMN:
-        bits &= bits - ONE
+        bits &= bits - ONE  # the lowest bit is gone
         count += 1
     return count
 
@@ -83,6 +86,7 @@ def columns_in(bits: np.uint64) -> int:
 @nb.njit(cache=True, nogil=True)
 def surfaces_into(grid: Grid, corners: Ints, counts: Ints) -> None:
     """Add to (Z,) counts, by height above the lowest voxel: occupied voxels with a known free one on them."""
+    # Layer by layer of each brick, sixteen columns at a time.
     for b in range(grid.words.shape[0]):
         above = brick_of(grid, corners[b, 0], corners[b, 1], corners[b, 2] + 8)
         for w in range(4):

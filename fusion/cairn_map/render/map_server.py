@@ -9,13 +9,34 @@ own saver writes, with which unknown space would be read as free. So 0.196 is wr
 """
 
 import json
+from pathlib import Path
 
 import numpy as np
 
+from cairn_map.errors import BadInputError
 from cairn_map.queries.floor_grid import FREE, OCCUPIED, FloorGrid
 
 OCCUPIED_BYTE, FREE_BYTE, UNKNOWN_BYTE = 0, 254, 205
 OCCUPIED_THRESHOLD, FREE_THRESHOLD = 0.65, 0.196
+
+
+def map_files(stem: Path) -> tuple[Path, Path]:
+    """Places of the picture and of its description, of a map of this name."""
+    return stem.with_name(f"{stem.name}.pgm"), stem.with_name(f"{stem.name}.yaml")
+
+
+def write_map_files(stem: Path, grid: FloorGrid) -> None:
+    """Write a grid as the files of a map of this name; the description last, so that it never names a part of one.
+
+    Raises:
+        BadInputError: kind `bad_output`.
+    """
+    picture, description = map_files(stem)
+    try:
+        picture.write_bytes(pgm_of(grid))
+        description.write_bytes(yaml_of(grid, picture.name))
+    except OSError as exc:
+        raise BadInputError("bad_output", f"cannot write {exc.filename}: {exc.strerror}") from exc
 
 
 def pgm_of(grid: FloorGrid) -> bytes:

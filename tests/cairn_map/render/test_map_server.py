@@ -7,7 +7,7 @@ import pytest
 from tests.fixtures.map.nav2_reader import load_map
 
 from cairn_map.queries.floor_grid import FREE, OCCUPIED, UNKNOWN, FloorGrid
-from cairn_map.render.map_server import pgm_of, yaml_of
+from cairn_map.render.map_server import pgm_of, write_map_files
 
 
 @pytest.mark.parametrize("edge_m", [0.04, 0.05, 0.16])
@@ -15,8 +15,7 @@ from cairn_map.render.map_server import pgm_of, yaml_of
 def test_nav2_loads_the_very_grid_that_was_written(tmp_path: Path, edge_m: float, name: str) -> None:
     values = np.random.default_rng(1).choice(np.array([FREE, OCCUPIED, UNKNOWN], np.int8), (7, 11))
     grid = FloorGrid(values, (-5.12, 10 * edge_m), edge_m, 0.0)
-    (tmp_path / f"{name}.pgm").write_bytes(pgm_of(grid))
-    (tmp_path / f"{name}.yaml").write_bytes(yaml_of(grid, f"{name}.pgm"))
+    write_map_files(tmp_path / name, grid)
     loaded = load_map(tmp_path / f"{name}.yaml")
     np.testing.assert_array_equal(loaded.data, values)
     assert loaded.resolution_m == edge_m

@@ -48,7 +48,7 @@ from cairn_map.files.cell_folder import FolderHead, write_cell, write_head
 from cairn_map.files.export_request import ExportRequest
 from cairn_map.machine_memory import standard_limit_bytes
 from cairn_map.progress import with_progress
-from cairn_map.render.map_server import pgm_of, yaml_of
+from cairn_map.render.map_server import map_files, write_map_files
 from cairn_map.wire.messages import MapInfo
 
 FORMATS = ("ply", "pcd", "laz", "npz", "ot", "bt")
@@ -203,14 +203,13 @@ def _export_floor(args: argparse.Namespace) -> int:
             "command once for each",
         )
     stem: Path = args.map_server
-    picture, description = stem.with_name(f"{stem.name}.pgm"), stem.with_name(f"{stem.name}.yaml")
+    picture, description = map_files(stem)
     _check_outputs(picture, description)
     box_m = None if args.box is None else np.stack(ExportRequest(box=args.box).bounds_m())
     snapshot = open_map(args.map, token=args.token.of(args.map), at_s=seconds_of(args.at))
     ground_m = asked_ground(snapshot, args)
     grid = snapshot.floor_grid(ground_m=ground_m, band_m=args.band, box_m=box_m)
-    picture.write_bytes(pgm_of(grid))
-    description.write_bytes(yaml_of(grid, picture.name))
+    write_map_files(stem, grid)
     H, W = grid.values.shape
     say(
         f"{picture}, {description}: {W} x {H} pixels of {shown_length(grid.edge_m)}, ground at {ground_m:.2f} m, "
