@@ -88,8 +88,8 @@ MAY_NAME = {
     "laspy": ["cairn_map/files/laz.py", "cairn_fusion/clouds/cloud_file.py"],
     "lazrs": ["cairn_map/files/laz.py"],
     "small_gicp": ["cairn_client/robot/alignment.py"],
-    "mcap": ["cairn_fusion/ros/mcap_bag.py"],
-    "rosbags": ["cairn_fusion/ros/ros1_bag.py"],
+    "mcap": ["cairn_fusion/ros/mcap_bag.py", "cairn_fusion/ros/mcap_writing.py"],
+    "rosbags": ["cairn_fusion/ros/ros1_bag.py", "cairn_fusion/ros/map_messages.py"],
     "matplotlib": ["cairn_calib/report/charts.py"],
     "jinja2": ["cairn_calib/report/page.py"],
     "lz4": ["cairn_fusion/ros/mcap_bag.py", "cairn_fusion/ros/ros1_bag.py"],
@@ -111,7 +111,7 @@ ROOMS = {
     """,
     "cairn_calib": "rig board board.discs exchange corner_search solve diagnosis report thermal verify cli",
     "cairn_fusion": "recording clouds ros transfer mapping image_fusion view importers warm_up",
-    "cairn_client": "replica sync http relay robot live folders cli cli.maps cli.robots main",
+    "cairn_client": "replica sync http relay robot live folders publish cli cli.maps cli.robots main",
     "cairn_sim": "scene render robots evaluation experiment study demo sim_command warm_up",
     "cairn_server": """
         memory_shares cell_room settings processes map_refusals

@@ -19,7 +19,7 @@ from cairn_map.epochs.cell_history import cell_history, row_fingerprint
 from cairn_map.epochs.cell_reading import CellReading
 from cairn_map.epochs.epoch import BASE, Epoch
 from cairn_map.epochs.present import present
-from cairn_map.errors import BadInputError
+from cairn_map.errors import BadInputError, NotFoundError
 from cairn_map.evidence.brick_cell import brick_cell, reading_cell
 from cairn_map.evidence.channels import planes_and_squares
 from cairn_map.evidence.compact_cell import HeldCell
@@ -198,6 +198,9 @@ def _ask(whole: FreezableMap) -> None:
     snapshot.nearest_unknown(points, radius_m=1)
     snapshot.frontier()
     snapshot.height_map()
+    with suppress(NotFoundError):
+        snapshot.grounds()
+    snapshot.floor_grid(ground_m=0.0)
     blend_into(np.zeros((1, 3), np.uint8), np.zeros((1, 4), np.uint8), np.zeros((1, 3), np.uint8))
 
 

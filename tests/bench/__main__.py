@@ -34,6 +34,7 @@ from tests.bench.many_maps import many_map_rows
 from tests.bench.marks import mark_rows
 from tests.bench.overlay import overlay_rows
 from tests.bench.peers import peer_rows
+from tests.bench.publishing import publishing_rows
 from tests.bench.queries import query_rows
 from tests.bench.readings import reading_rows
 from tests.bench.scale import scale_rows
@@ -289,6 +290,7 @@ PARTS: dict[str, Callable[[bool], Iterator[Row]]] = {
     "marks": mark_rows,
     "overlay": overlay_rows,
     "peers": peer_rows,
+    "publishing": publishing_rows,
     "queries": query_rows,
     "readings": reading_rows,
     "scale": scale_rows,

@@ -144,3 +144,14 @@ def tops(world: World) -> dict[tuple[int, int], int]:
         if state(world, (x, y, z)) == OCCUPIED:
             found[x, y] = z
     return found
+
+
+def floor_column(world: World, column: tuple[int, int], *, zone_low: int, band_low: int, band_high: int) -> int:
+    """A pixel of a floor grid, by the voxels' numbers: 100 occupied, 0 free, -1 unknown."""
+    down = [state(world, (*column, z)) for z in range(band_high - 1, zone_low - 1, -1)]
+    if OCCUPIED in down[: band_high - band_low]:
+        return 100
+    for here in down:
+        if here != FREE:
+            return 0 if here == OCCUPIED else -1
+    return -1

@@ -27,6 +27,7 @@ from cairn_map.files.cell_folder import MAP_FILE, cell_path, read_cells, read_he
 from cairn_map.machine_memory import standard_limit_bytes
 from cairn_map.queries.map_snapshot import MapSnapshot, snapshot_at, snapshot_of
 from cairn_map.render.map_picture import Ages
+from cairn_map.wire.messages import MapInfo
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,29 +109,39 @@ def _downloaded_map(
         whole = HistoryMap(info.layer, coding=coding_of(info.geometry))
         keys = cells_with_evidence(api, name)
         for key in keys if needs is None else needed_cells(keys, needs, info.geometry):
-            # What is left bounds the cell before it is decoded: few bytes may stand for much evidence.
-            left_bytes = memory_bytes_max - whole.size_bytes
-            try:
-                bytes_max = min(left_bytes, EVIDENCE_BYTES_MAX)
-                body, decoded = download_cell(api, name, key, info.layer, evidence_bytes_max=bytes_max)
-            except BadInputError as exc:
-                if exc.kind == "too_large" and left_bytes < EVIDENCE_BYTES_MAX:
-                    raise _too_large(map_url, memory_bytes_max) from exc
-                raise
-            whole.replace(key, decoded.history, bodies=row_bodies(body, key, info.layer), came_bytes=len(body))
-            if whole.size_bytes > memory_bytes_max:
-                raise _too_large(map_url, memory_bytes_max)
+            download_into(whole, api, info, key, memory_bytes_max=memory_bytes_max)
     return _snapshot(whole, info.sensor_model, at_s)
+
+
+def download_into(whole: HistoryMap, api: MapApi, info: MapInfo, key: CellKey, *, memory_bytes_max: int) -> None:
+    """Replace a cell of a map in memory by the server's.
+
+    Raises:
+        BadInputError: kind `too_large`: the map would take more memory than that.
+        CairnError: as `download_cell`.
+    """
+    # What is left bounds the cell before it is decoded: few bytes may stand for much evidence.
+    left_bytes = memory_bytes_max - whole.size_bytes
+    try:
+        bytes_max = min(left_bytes, EVIDENCE_BYTES_MAX)
+        body, decoded = download_cell(api, info.name, key, info.layer, evidence_bytes_max=bytes_max)
+    except BadInputError as exc:
+        if exc.kind == "too_large" and left_bytes < EVIDENCE_BYTES_MAX:
+            raise _too_large(info.name, memory_bytes_max) from exc
+        raise
+    whole.replace(key, decoded.history, bodies=row_bodies(body, key, info.layer), came_bytes=len(body))
+    if whole.size_bytes > memory_bytes_max:
+        raise _too_large(info.name, memory_bytes_max)
 
 
 def _snapshot(whole: HistoryMap, model: SensorModel, at_s: float | None) -> MapSnapshot:
     return snapshot_of(whole, model) if at_s is None else snapshot_at(whole, model, at_s)
 
 
-def _too_large(map_url: str, memory_bytes_max: int) -> BadInputError:
+def _too_large(name: str, memory_bytes_max: int) -> BadInputError:
     return BadInputError(
         "too_large",
-        f"{map_url} takes more than {memory_bytes_max} bytes in memory (memory_bytes_max): give it more, or save a "
+        f"map {name} takes more than {memory_bytes_max} bytes in memory (memory_bytes_max): give it more, or save a "
         "part of it with `cairn map export --box --npz FILE`",
     )
 

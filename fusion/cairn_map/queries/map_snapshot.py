@@ -30,9 +30,10 @@ from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.grid import Cell, Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.evidence.voxels import Reading, Voxels
-from cairn_map.queries import body_queries, distance_queries, point_queries, region_queries
+from cairn_map.queries import body_queries, distance_queries, floor_grid, point_queries, region_queries
 from cairn_map.queries.body_queries import PathStates
 from cairn_map.queries.distance_queries import Nearest, RayEnds
+from cairn_map.queries.floor_grid import Band, FloorGrid
 from cairn_map.queries.frozen_map import Box, FreezableMap, FrozenMap, freeze
 from cairn_map.queries.occupancy_states import State
 from cairn_map.queries.region_queries import MapImage
@@ -226,6 +227,31 @@ class MapSnapshot:
             BadInputError: kind `too_large`: more than 67 million pixels.
         """
         return region_queries.height_map(self._frozen, box_m)
+
+    def floor_grid(self, *, ground_m: float, band_m: Band | None = None, box_m: Box | None = None) -> FloorGrid:
+        """A storey as a ground robot sees it: 100 occupied, 0 free, -1 unknown, as in `nav_msgs/OccupancyGrid`.
+
+        A column is occupied if a voxel of the band is. It is free if, from the band's top down, all is known free to
+        an occupied voxel within the band's lowest height of the ground; else it is unknown.
+
+        Args:
+            ground_m: height of the storey's ground, metres, map frame; `grounds` finds it.
+            band_m: lowest and highest height above the ground that the robot takes; None: 0.1 to 1.5 m, from a voxel
+                on where voxels are coarser.
+            box_m: its x and y bound the grid; its z does not matter.
+
+        Raises:
+            BadInputError: kind `bad_band`; `too_large`: more than 67 million pixels.
+        """
+        return floor_grid.floor_grid(self._frozen, ground_m, band_m, box_m)
+
+    def grounds(self, *, band_m: Band | None = None) -> list[tuple[float, float]]:
+        """Height (metres, map frame) and free area (square metres) of each storey's ground, the largest first.
+
+        Raises:
+            NotFoundError: kind `no_ground`: no column is free at any height.
+        """
+        return floor_grid.grounds(self._frozen, band_m)
 
     def hottest(self, n: int, *, min_probability: float = 0.5, box_m: Box | None = None) -> Voxels:
         """The n known voxels with the highest mean temperature, hottest first, fewer if there are no more.

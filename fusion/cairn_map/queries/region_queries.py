@@ -50,7 +50,8 @@ def layer(frozen: FrozenMap, z_m: float, what: str, box_m: Box | None) -> MapIma
     if not abs(z_m) < frozen.reach_m:
         raise BadInputError("point_range", f"the height must be finite and within {frozen.reach_m:.0f} m, got {z_m}")
     ask = _question(frozen, what)
-    low, high = _checked(*frozen.voxels_of_box(box_m))
+    low, high = frozen.voxels_of_box(box_m)
+    check_pixels(low, high)
     W, H = high[0] - low[0], high[1] - low[1]
     centres_x, centres_y = (_centres(frozen, low[axis], high[axis]) for axis in (0, 1))
     rows_at_once = max(1, point_queries.CHUNK // max(W, 1))
@@ -65,7 +66,8 @@ def layer(frozen: FrozenMap, z_m: float, what: str, box_m: Box | None) -> MapIma
 
 def height_map(frozen: FrozenMap, box_m: Box | None) -> MapImage:
     """The height of each column's highest occupied voxel's upper face; NaN where there is none."""
-    low, high = _checked(*frozen.voxels_of_box(box_m))
+    low, high = frozen.voxels_of_box(box_m)
+    check_pixels(low, high)
     tops = np.full((high[1] - low[1], high[0] - low[0]), NO_TOP)
     kernels.tops_into(frozen.grid, frozen.brick_corners(), low, high, tops)
     heights = np.where(tops == NO_TOP, np.nan, (tops + 1) * frozen.geometry.voxel_edge_m)
@@ -84,11 +86,15 @@ def _question(frozen: FrozenMap, what: str) -> Callable[[Floats], Values]:
     return lambda points: point_queries.reading_at(frozen, points, channel).mean
 
 
-def _checked(low: npt.NDArray[np.int64], high: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.int64], ...]:
+def check_pixels(low: Ints, high: Ints) -> None:
+    """Refuse images, of voxels from `low` up to `high`, that are larger than an image may be.
+
+    Raises:
+        BadInputError: kind `too_large`.
+    """
     pixels = int(high[0] - low[0]) * int(high[1] - low[1])
     if pixels > PIXELS_MAX:
         raise BadInputError("too_large", f"an image has at most {PIXELS_MAX} pixels, not {pixels}; give a smaller box")
-    return low, high
 
 
 def _centres(frozen: FrozenMap, low: int, high: int) -> Floats:

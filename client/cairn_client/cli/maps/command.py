@@ -7,6 +7,8 @@
     $ cairn map info http://127.0.0.1:8750/maps/lab
     $ cairn map get http://127.0.0.1:8750/maps/lab 0,0,0 -o cell.ply
     $ cairn map export http://127.0.0.1:8750/maps/lab --ply lab.ply --picture lab.png --cells lab/
+    $ cairn map export http://127.0.0.1:8750/maps/lab --map-server floor1
+    $ cairn map publish http://127.0.0.1:8750/maps/lab --foxglove 8766
     $ cairn map log http://127.0.0.1:8750/maps/lab --graph
     $ cairn map changes http://127.0.0.1:8750/maps/lab --since 14:05
     $ cairn map marks http://127.0.0.1:8750/maps/lab
@@ -30,7 +32,7 @@ import time
 from pathlib import Path
 
 from cairn_calib.rig.rig import load_rig
-from cairn_client.cli import marks
+from cairn_client.cli import marks, publish
 from cairn_client.cli.arguments import (
     Subparsers,
     add_map_parser,
@@ -78,6 +80,7 @@ def main(argv: list[str]) -> int:
         map_export.add_export_parser,
         marks.add_list_parser,
         marks.add_parser,
+        publish.add_parser,
         query.add_parser,
         render.add_parser,
         _add_retract,

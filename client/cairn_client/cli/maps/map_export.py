@@ -6,6 +6,11 @@ A whole map is made into files here, from its cells; a part of a map is made by 
     lab.pcd: 1.4 MB
     $ cairn map export http://127.0.0.1:8750/maps/lab --bt lab.bt       # for planners: occupied and free space
     lab.bt: 188 kB
+
+A storey as a ground robot sees it, for Nav2's map server; without --ground the storey with the largest free area:
+
+    $ cairn map export http://127.0.0.1:8750/maps/lab --map-server floor1 --band 0.1,1.5
+    floor1.pgm, floor1.yaml: 640 x 512 pixels of 4 cm, ground at 0.00 m, 96.1 m2 free, 12.4 m2 occupied
 """
 
 import argparse
@@ -15,9 +20,21 @@ from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import urlencode
 
+import numpy as np
 from pydantic import ValidationError
 
-from cairn_client.cli.arguments import Subparsers, add_at, add_map_parser, api_of, say, seconds_of, shown_bytes
+from cairn_client.cli.arguments import (
+    Subparsers,
+    add_at,
+    add_map_parser,
+    api_of,
+    say,
+    seconds_of,
+    shown_bytes,
+    shown_length,
+)
+from cairn_client.cli.floor_arguments import add_floor_arguments, asked_ground
+from cairn_client.folders.map_folder import open_map
 from cairn_client.http.api import MapApi
 from cairn_client.http.http_link import cells_with_evidence, download_cell
 from cairn_map.codec.history_code import DecodedHistory
@@ -31,6 +48,7 @@ from cairn_map.files.cell_folder import FolderHead, write_cell, write_head
 from cairn_map.files.export_request import ExportRequest
 from cairn_map.machine_memory import standard_limit_bytes
 from cairn_map.progress import with_progress
+from cairn_map.render.map_server import map_files, write_map_files
 from cairn_map.wire.messages import MapInfo
 
 FORMATS = ("ply", "pcd", "laz", "npz", "ot", "bt")
@@ -60,6 +78,10 @@ def add_export_parser(commands: Subparsers) -> None:
     export.add_argument(
         "--ceiling", type=float, metavar="METRES", help="leave out higher voxels; with --picture, in the picture alone"
     )
+    export.add_argument(
+        "--map-server", type=Path, metavar="NAME", help="a storey's floor for Nav2's map server: NAME.pgm and NAME.yaml"
+    )
+    add_floor_arguments(export)
     add_at(export)
     _add_part_arguments(export)
 
@@ -119,6 +141,10 @@ def _get(args: argparse.Namespace) -> int:
 
 def _export(args: argparse.Namespace) -> int:
     """Download all cells, and write the files that the options name."""
+    if args.map_server is not None:
+        return _export_floor(args)
+    if args.ground is not None or args.band is not None:
+        raise BadInputError("bad_option", "--ground and --band are about a storey's floor: give --map-server NAME")
     if _is_part(args):
         _check_outputs(*(getattr(args, form) for form in FORMATS))
         api, name = api_of(args.map, args.token)
@@ -126,7 +152,10 @@ def _export(args: argparse.Namespace) -> int:
             _export_part(api, name, args)
         return 0
     if not (args.cells or args.ply or args.npz or args.picture):
-        raise BadInputError("nothing_asked", "say what to write: --cells DIR, --ply FILE, --npz FILE or --picture FILE")
+        raise BadInputError(
+            "nothing_asked",
+            "say what to write: --cells DIR, --ply FILE, --npz FILE, --picture FILE or --map-server NAME",
+        )
     if args.cells and args.at is not None:
         raise BadInputError("bad_option", WHOLE_AT)
     _check_outputs(args.ply, args.npz, args.picture)
@@ -155,6 +184,37 @@ def _export(args: argparse.Namespace) -> int:
             edge_m = info.geometry.voxel_edge_m
             write_map_picture(args.picture, occupied, voxel_edge_m=edge_m, ceiling_m=args.ceiling)
             say(f"{args.picture}: {len(occupied)} occupied voxels")
+    return 0
+
+
+def _export_floor(args: argparse.Namespace) -> int:
+    """Write a storey's floor as a picture and its description.
+
+    Raises:
+        BadInputError: kind `bad_option`: there are options that are not about a floor; `bad_box`, `bad_band`.
+        NotFoundError: kind `no_ground`.
+    """
+    others = ("cells", "picture", *FORMATS, "floor", "ceiling", "p", "hotter", "colder", "depth", "unknown")
+    given = [name for name in others if getattr(args, name) is not None]
+    if given:
+        raise BadInputError(
+            "bad_option",
+            f"--{given[0]} does not go with --map-server, which takes --ground, --band, --box and --at: run the "
+            "command once for each",
+        )
+    stem: Path = args.map_server
+    picture, description = map_files(stem)
+    _check_outputs(picture, description)
+    box_m = None if args.box is None else np.stack(ExportRequest(box=args.box).bounds_m())
+    snapshot = open_map(args.map, token=args.token.of(args.map), at_s=seconds_of(args.at))
+    ground_m = asked_ground(snapshot, args)
+    grid = snapshot.floor_grid(ground_m=ground_m, band_m=args.band, box_m=box_m)
+    write_map_files(stem, grid)
+    H, W = grid.values.shape
+    say(
+        f"{picture}, {description}: {W} x {H} pixels of {shown_length(grid.edge_m)}, ground at {ground_m:.2f} m, "
+        f"{grid.free_m2:.1f} m2 free, {grid.occupied_m2:.1f} m2 occupied"
+    )
     return 0
 
 

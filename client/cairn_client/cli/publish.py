@@ -1,0 +1,180 @@
+"""Publish a map for Foxglove, RViz and bags: as messages of ROS 2, kept up to date by the map's live events.
+
+    $ cairn map publish http://127.0.0.1:8750/maps/lab --foxglove 8766      # until Ctrl-C
+    lab at ws://127.0.0.1:8766: open it in Foxglove or Lichtblick ("Foxglove WebSocket")
+    15:04:05  12 cells: ground at 0.00 m, published 0.31 s after the news
+    15:04:10  3 cells: ground at 0.00 m, published 0.09 s after the news
+    $ cairn map publish http://127.0.0.1:8750/maps/lab --mcap lab.mcap       # as it is now
+    lab.mcap: 5 messages, 1.4 MB
+    $ cairn map publish http://127.0.0.1:8750/maps/lab --mcap run.mcap --follow --changes 20
+
+Topics, all in the frame `map` (--frame), lengths in metres, temperatures in degrees Celsius:
+
+    /map                        nav_msgs/OccupancyGrid: a storey's floor, 100 occupied, 0 free, -1 unknown
+    /cairn/points               sensor_msgs/PointCloud2: all occupied voxels, at most every 10 s
+    /cairn/changed_points       sensor_msgs/PointCloud2: those of the cells that changed
+    /cairn/hot_spots            visualization_msgs/MarkerArray: the ten hottest places
+    /cairn/octomap              octomap_msgs/Octomap: occupied and free space, once, with --octomap
+    /tf                         tf2_msgs/TFMessage: robots that report where they are, each the frame of its name
+    /cairn/robots/NAME/path     nav_msgs/Path: the way of one, since publishing began
+
+A viewer that joins late gets the newest message of each topic at once. The server of --foxglove has no access control:
+it listens on this machine alone, unless another address is given (--foxglove 0.0.0.0:8766). For Nav2's map server
+there are files: `cairn map export URL --map-server NAME`.
+"""
+
+import argparse
+import re
+import sys
+import time
+from contextlib import ExitStack
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from cairn_client.cli.arguments import Subparsers, add_token, api_of, say, shown_bytes
+from cairn_client.cli.floor_arguments import add_floor_arguments
+from cairn_client.http.api import MapApi
+from cairn_client.http.live_listener import Lost, listen
+from cairn_map.errors import BadInputError, UnreachableError
+from cairn_map.wire.live_events import CellsEvent, Hello, RobotHeard
+
+if TYPE_CHECKING:
+    from cairn_client.publish.followed_map import FollowedMap
+    from cairn_client.publish.map_publisher import MapPublisher
+
+ADDRESS = re.compile(r"(?:(?P<host>[^\s:]+|\[[0-9a-fA-F:]+\]):)?(?P<port>\d{1,5})")
+FRAME = re.compile(r"[A-Za-z][\w./-]{0,63}")
+
+
+def add_parser(commands: Subparsers) -> None:
+    """Add the subcommand."""
+    text = "publish a map for Foxglove, RViz and bags"
+    publish = commands.add_parser("publish", help=text, description=__doc__)
+    publish.add_argument("map", help="http://HOST:PORT/maps/NAME")
+    publish.add_argument("--foxglove", type=_address, metavar="[HOST:]PORT", help="serve viewers here (0: a free port)")
+    publish.add_argument("--mcap", type=Path, metavar="FILE", help="write the messages into a file")
+    publish.add_argument("--follow", action="store_true", help="go on with each change; with --foxglove it does")
+    publish.add_argument("--changes", type=int, metavar="N", help="end after so many changes, the first state included")
+    publish.add_argument("--octomap", action="store_true", help="the octree of occupied and free space, too, once")
+    publish.add_argument("--frame", default="map", type=_frame, metavar="NAME", help="frame of the map (map)")
+    add_floor_arguments(publish)
+    add_token(publish)
+    publish.set_defaults(run=_run)
+
+
+def _run(args: argparse.Namespace) -> int:
+    if args.foxglove is None and args.mcap is None:
+        raise BadInputError("nothing_asked", "say where to publish: --foxglove PORT, or --mcap FILE")
+    try:
+        from cairn_client.publish.followed_map import FollowedMap
+        from cairn_client.publish.foxglove_server import FoxgloveServer
+        from cairn_client.publish.map_publisher import FloorChoice, MapPublisher, Sink
+        from cairn_fusion.ros.mcap_writing import McapFile
+    except ModuleNotFoundError as exc:
+        raise BadInputError(
+            "missing_extra", f'publishing needs {exc.name}: pip install "cairn-robotics[robot]"'
+        ) from exc
+    api, name = api_of(args.map, args.token)
+    with ExitStack() as open_parts:
+        open_parts.enter_context(api)
+        followed = FollowedMap(api, name)
+        # Checked before a file is begun: a band is of the map's voxels.
+        followed.snapshot.floor_grid(ground_m=args.ground or 0.0, band_m=args.band)
+        sinks: list[Sink] = []
+        if args.foxglove is not None:
+            host, port = args.foxglove
+            server = open_parts.enter_context(FoxgloveServer(f"cairn: {name}", host=host, port=port))
+            sinks.append(server)
+            _say_at_once(f'{name} at {server.url}: open it in Foxglove or Lichtblick ("Foxglove WebSocket")')
+        if args.mcap is not None:
+            file = McapFile(args.mcap)
+            # After it is closed, also by Ctrl-C, which is how a file that follows a map ends.
+            open_parts.callback(lambda: say(f"{file.path}: {file.count} messages, {_shown_size(file.path)}"))
+            sinks.append(open_parts.enter_context(file))
+        choice = FloorChoice(ground_m=args.ground, band_m=args.band, frame=args.frame)
+        publisher = MapPublisher(api, followed, sinks, choice)
+        if args.foxglove is None and not args.follow:
+            _publish_once(api, followed, publisher, args)
+        else:
+            _follow(api, followed, publisher, args)
+    return 0
+
+
+def _publish_once(api: MapApi, followed: "FollowedMap", publisher: "MapPublisher", args: argparse.Namespace) -> None:
+    publisher.publish_changes(followed.fetch())
+    if args.octomap:
+        publisher.publish_octree()
+    for branch in api.branches(followed.info.name):
+        publisher.publish_robot(branch.branch, branch.status)
+
+
+def _follow(api: MapApi, followed: "FollowedMap", publisher: "MapPublisher", args: argparse.Namespace) -> None:
+    """Publish the present state and each change, without an end but for `--changes`."""
+    heard_s, left, is_first = time.monotonic(), args.changes, True
+    for event in listen(api, followed.info.name):
+        match event:
+            case Lost():
+                _say_now(f"link lost: {event.reason}; trying again in {event.retry_in_s:.1f} s")
+                continue
+            case Hello():
+                if not event.resumed:
+                    heard_s = time.monotonic()
+                    followed.note_any()
+                for sign in event.robots:
+                    publisher.publish_robot(sign.branch, sign.status)
+            case CellsEvent():
+                heard_s = time.monotonic() if not followed.has_news else heard_s
+                followed.note(event)
+                continue  # `head` ends the changes of a fold
+            case RobotHeard() if event.robot.gone:
+                publisher.forget_robot(event.robot.branch)
+            case RobotHeard():
+                publisher.publish_robot(event.robot.branch, event.robot.status)
+            case _:
+                pass
+        if not followed.has_news:
+            publisher.publish_whole()
+            continue
+        try:
+            changed = followed.fetch()
+            publisher.publish_changes(changed)
+            if is_first and args.octomap:
+                publisher.publish_octree()
+        except UnreachableError as exc:
+            _say_now(f"{exc.message}; trying again with the next sign of life")
+            continue
+        is_first = False
+        ground = "no ground yet" if publisher.ground_m is None else f"ground at {publisher.ground_m:.2f} m"
+        _say_now(f"{len(changed)} cells: {ground}, published {time.monotonic() - heard_s:.2f} s after the news")
+        if left is not None:
+            left -= 1
+            if left <= 0:
+                return
+
+
+def _shown_size(path: Path) -> str:
+    return shown_bytes(path.stat().st_size)
+
+
+def _say_now(text: str) -> None:
+    _say_at_once(f"{datetime.now(UTC):%H:%M:%S}  {text}")
+
+
+def _say_at_once(text: str) -> None:
+    """Say a line so that a program that reads a pipe gets it at once."""
+    say(text)
+    sys.stdout.flush()
+
+
+def _address(text: str) -> tuple[str, int]:
+    found = ADDRESS.fullmatch(text)
+    if not found or int(found["port"]) > 65_535:
+        raise argparse.ArgumentTypeError(f"an address is PORT or HOST:PORT, such as 8766; got {text!r}")
+    return (found["host"] or "127.0.0.1").strip("[]"), int(found["port"])
+
+
+def _frame(text: str) -> str:
+    if not FRAME.fullmatch(text):
+        raise argparse.ArgumentTypeError(f"a frame is a name of letters, digits, '_', '.', '/' and '-'; got {text!r}")
+    return text
