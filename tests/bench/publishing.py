@@ -50,10 +50,10 @@ def publishing_rows(smoke: bool) -> Iterator[Row]:
             ("its picture for map servers", lambda: pgm_of(grid)),
         ):
             yield f"  {what}", f"{1e3 * wall_s(work, repeats):.1f}", "ms"  # type: ignore[arg-type]
-        yield from _change_rows(folder, Path(name) / "server", changes=3 if smoke else 30)
+        yield from _change_rows(folder, Path(name) / "server", ground_m=ground_m, changes=3 if smoke else 30)
 
 
-def _change_rows(folder: Path, data: Path, *, changes: int) -> Iterator[Row]:
+def _change_rows(folder: Path, data: Path, *, ground_m: float, changes: int) -> Iterator[Row]:
     server = Process(data)
     try:
         assert server.url
@@ -63,8 +63,9 @@ def _change_rows(folder: Path, data: Path, *, changes: int) -> Iterator[Row]:
             geometry = api.map_info(MAP).geometry
             diffs = scan_diffs("orpheus", geometry, scale=0.25, scans=4)
             port = free_port("127.0.0.1")
-            words = ["publish", f"{server.url}/maps/{MAP}", "--foxglove", str(port), "--changes", str(changes + 1)]
-            publishing = threading.Thread(target=map_command, args=(words,))
+            words = ["publish", f"{server.url}/maps/{MAP}", "--foxglove", str(port), f"--ground={ground_m}"]
+            words.append(f"--changes={changes + 1}")
+            publishing = threading.Thread(target=map_command, args=(words,), daemon=True)
             publishing.start()
             seconds = []
             with _joined(port) as viewer, MapApi(server.url) as robot:
@@ -89,7 +90,7 @@ def _joined(port: int) -> FoxgloveViewer:
     until_s = time.monotonic() + JOIN_S
     while True:
         try:
-            return FoxgloveViewer(f"ws://127.0.0.1:{port}")
+            return FoxgloveViewer(f"ws://127.0.0.1:{port}", wait_s=JOIN_S)
         except ConnectionRefusedError:
             if time.monotonic() > until_s:
                 raise

@@ -70,7 +70,7 @@ def _run(args: argparse.Namespace) -> int:
         from cairn_client.publish.followed_map import FollowedMap
         from cairn_client.publish.foxglove_server import FoxgloveServer
         from cairn_client.publish.map_publisher import FloorChoice, MapPublisher, Sink
-        from cairn_fusion.ros.mcap_writing import McapFile
+        from cairn_client.publish.mcap_file import McapFile
     except ModuleNotFoundError as exc:
         raise BadInputError(
             "missing_extra", f'publishing needs {exc.name}: pip install "cairn-robotics[robot]"'

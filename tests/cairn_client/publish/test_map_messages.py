@@ -9,11 +9,11 @@ from tests.fixtures.fusion.cdr_reader import read_message
 from tests.fixtures.map.made import SMALL
 from tests.fixtures.map.worlds import random_map
 
+from cairn_client.publish.mcap_file import McapFile
 from cairn_fusion.ros import map_messages
 from cairn_fusion.ros.bag import Wire
 from cairn_fusion.ros.map_messages import HotSpot, MapMessage, RobotPose
 from cairn_fusion.ros.mcap_bag import McapBag
-from cairn_fusion.ros.mcap_writing import McapFile
 from cairn_fusion.ros.messages import read_transforms
 from cairn_fusion.ros.point_clouds import read_points
 from cairn_map.errors import BadInputError, DamagedDataError
