@@ -4,7 +4,7 @@
     short reply        ####                  most need only one
 
 The interpreter computes in one thread at a time, and threads that all want to compute keep pushes and the event loop
-from it: of 200 robots, pushes took 62 ms (median) beside two replies in the making, and 96 beside eight.
+from it: of 200 robots, pushes took 62 ms (median) while two replies were made at once, and 96 while eight were.
 """
 
 import threading
@@ -30,7 +30,7 @@ class Slices:
         self._steady_s = steady_s
         self._lock = threading.Lock()
         self._waiting: deque[threading.Lock] = deque()
-        """Of each thread that waits, the lock that it waits for."""
+        """Locks that threads wait for, one of each, the oldest first."""
 
     @property
     def waiting(self) -> int:
@@ -38,7 +38,7 @@ class Slices:
         return len(self._waiting)
 
     def of(self, parts: Iterable[T]) -> Iterator[T]:
-        """The same parts, made in slices; whoever takes them must not wait between two of them."""
+        """The same parts, made in slices; the caller takes them without waiting between two of them."""
         self._take()
         try:
             end_s = self._steady_s() + SLICE_S
@@ -61,7 +61,7 @@ class Slices:
     def _give(self) -> None:
         with self._lock:
             if self._waiting:
-                self._waiting.popleft().release()  # handed over: nobody comes between
+                self._waiting.popleft().release()  # handed over, so that no other thread takes it first
             else:
                 self._free += 1
 
