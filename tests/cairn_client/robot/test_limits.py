@@ -240,7 +240,7 @@ def test_commits_that_are_stable_go_first(server: LiveServer, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(
-    ("limits", "left"), [(Limits(memory_bytes_max=1 << 16), 1), (Limits(disk_bytes_max=66_000), 0)]
+    ("limits", "left"), [(Limits(memory_bytes_max=1 << 16), 1), (Limits(disk_bytes_max=76_000), 0)]
 )
 def test_a_map_too_large_for_the_memory_drops_no_acknowledged_bytes(
     row_server: LiveServer, tmp_path: Path, limits: Limits, left: int
