@@ -16,11 +16,13 @@ Topics, all in the frame `map` (--frame), lengths in metres, temperatures in deg
     /cairn/hot_spots            visualization_msgs/MarkerArray: the ten hottest places
     /cairn/octomap              octomap_msgs/Octomap: occupied and free space, once, with --octomap
     /tf                         tf2_msgs/TFMessage: robots that report where they are, each the frame of its name
-    /cairn/robots/NAME/path     nav_msgs/Path: the way of one, since publishing began
+    /cairn/robots/NAME/path     nav_msgs/Path: the way of one since publishing began, at most every 3 s
 
-A viewer that joins late gets the newest message of each topic at once. The server of --foxglove has no access control:
-it listens on this machine alone, unless another address is given (--foxglove 0.0.0.0:8766). For Nav2's map server
-there are files: `cairn map export URL --map-server NAME`.
+The storey of /map is that of --ground; without it the largest one, chosen again after each change, but left only for
+one with twice its free area. A viewer that joins late gets the newest message of each topic at once.
+
+The server of --foxglove has no access control: it listens on this machine alone, unless another address is given
+(--foxglove 0.0.0.0:8766). For Nav2's map server there are files: `cairn map export URL --map-server NAME`.
 """
 
 import argparse
@@ -133,12 +135,12 @@ def _follow(api: MapApi, followed: "FollowedMap", publisher: "MapPublisher", arg
                 publisher.publish_robot(event.robot.branch, event.robot.status)
             case _:
                 pass
-        if not followed.has_news:
-            publisher.publish_whole()
+        # After a link that broke no news may be left but what is not published yet.
+        if not (followed.has_news or publisher.is_behind or is_first):
+            publisher.publish_due()
             continue
         try:
-            changed = followed.fetch()
-            publisher.publish_changes(changed)
+            count = publisher.publish_changes(followed.fetch())
             if is_first and args.octomap:
                 publisher.publish_octree()
         except UnreachableError as exc:
@@ -146,7 +148,7 @@ def _follow(api: MapApi, followed: "FollowedMap", publisher: "MapPublisher", arg
             continue
         is_first = False
         ground = "no ground yet" if publisher.ground_m is None else f"ground at {publisher.ground_m:.2f} m"
-        _say_now(f"{len(changed)} cells: {ground}, published {time.monotonic() - heard_s:.2f} s after the news")
+        _say_now(f"{count} cells: {ground}, published {time.monotonic() - heard_s:.2f} s after the news")
         if left is not None:
             left -= 1
             if left <= 0:
