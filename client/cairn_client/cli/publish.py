@@ -22,7 +22,8 @@ The storey of /map is that of --ground; without it the largest one, chosen again
 one with twice its free area. A viewer that joins late gets the newest message of each topic at once.
 
 The server of --foxglove has no access control: it listens on this machine alone, unless another address is given
-(--foxglove 0.0.0.0:8766). For Nav2's map server there are files: `cairn map export URL --map-server NAME`.
+(--foxglove 0.0.0.0:8766). Browsers' pages are refused but for Foxglove's own; --origin http://viewer:8080 lets those of
+a Lichtblick of your own in. For Nav2's map server there are files: `cairn map export URL --map-server NAME`.
 """
 
 import argparse
@@ -46,6 +47,7 @@ if TYPE_CHECKING:
     from cairn_client.publish.map_publisher import MapPublisher
 
 ADDRESS = re.compile(r"(?:(?P<host>[^\s:]+|\[[0-9a-fA-F:]+\]):)?(?P<port>\d{1,5})")
+ORIGIN = re.compile(r"https?://[^\s/]+/?", re.IGNORECASE)
 FRAME = re.compile(r"[A-Za-z][\w./-]{0,63}")
 
 
@@ -55,6 +57,9 @@ def add_parser(commands: Subparsers) -> None:
     publish = commands.add_parser("publish", help=text, description=__doc__)
     publish.add_argument("map", help="http://HOST:PORT/maps/NAME")
     publish.add_argument("--foxglove", type=_address, metavar="[HOST:]PORT", help="serve viewers here (0: a free port)")
+    publish.add_argument(
+        "--origin", action="append", default=[], type=_origin, metavar="URL", help="pages of this origin may join, too"
+    )
     publish.add_argument("--mcap", type=Path, metavar="FILE", help="write the messages into a file")
     publish.add_argument("--follow", action="store_true", help="go on with each change; with --foxglove it does")
     publish.add_argument("--changes", type=int, metavar="N", help="end after so many changes, the first state included")
@@ -86,7 +91,9 @@ def _run(args: argparse.Namespace) -> int:
         sinks: list[Sink] = []
         if args.foxglove is not None:
             host, port = args.foxglove
-            server = open_parts.enter_context(FoxgloveServer(f"cairn: {name}", host=host, port=port))
+            server = open_parts.enter_context(
+                FoxgloveServer(f"cairn: {name}", host=host, port=port, origins=args.origin)
+            )
             sinks.append(server)
             _say_at_once(f'{name} at {server.url}: open it in Foxglove or Lichtblick ("Foxglove WebSocket")')
         if args.mcap is not None:
@@ -174,6 +181,12 @@ def _address(text: str) -> tuple[str, int]:
     if not found or int(found["port"]) > 65_535:
         raise argparse.ArgumentTypeError(f"an address is PORT or HOST:PORT, such as 8766; got {text!r}")
     return (found["host"] or "127.0.0.1").strip("[]"), int(found["port"])
+
+
+def _origin(text: str) -> str:
+    if not ORIGIN.fullmatch(text):
+        raise argparse.ArgumentTypeError(f"an origin is http://HOST:PORT or https://HOST, got {text!r}")
+    return text.rstrip("/").lower()
 
 
 def _frame(text: str) -> str:
