@@ -21,6 +21,8 @@ Topics, all in the frame `map` (--frame), lengths in metres, temperatures in deg
 The storey of /map is that of --ground; without it the largest one, chosen again after each change, but left only for
 one with twice its free area. A viewer that joins late gets the newest message of each topic at once.
 
+A file is FILE.part until the command ends, at a change's number, by Ctrl-C or by SIGTERM; then it has its index.
+
 The server of --foxglove has no access control: it listens on this machine alone, unless another address is given
 (--foxglove 0.0.0.0:8766). Browsers' pages are refused but for Foxglove's own; --origin http://viewer:8080 lets those of
 a Lichtblick of your own in. For Nav2's map server there are files: `cairn map export URL --map-server NAME`.
@@ -28,9 +30,12 @@ a Lichtblick of your own in. For Nav2's map server there are files: `cairn map e
 
 import argparse
 import re
+import signal
 import sys
+import threading
 import time
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -45,6 +50,7 @@ from cairn_map.wire.live_events import CellsEvent, Hello, RobotHeard
 if TYPE_CHECKING:
     from cairn_client.publish.followed_map import FollowedMap
     from cairn_client.publish.map_publisher import MapPublisher
+    from cairn_client.publish.mcap_file import McapFile
 
 ADDRESS = re.compile(r"(?:(?P<host>[^\s:]+|\[[0-9a-fA-F:]+\]):)?(?P<port>\d{1,5})")
 ORIGIN = re.compile(r"https?://[^\s/]+/?", re.IGNORECASE)
@@ -71,8 +77,7 @@ def add_parser(commands: Subparsers) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    if args.foxglove is None and args.mcap is None:
-        raise BadInputError("nothing_asked", "say where to publish: --foxglove PORT, or --mcap FILE")
+    _check_options(args)
     try:
         from cairn_client.publish.followed_map import FollowedMap
         from cairn_client.publish.foxglove_server import FoxgloveServer
@@ -83,7 +88,7 @@ def _run(args: argparse.Namespace) -> int:
             "missing_extra", f'publishing needs {exc.name}: pip install "cairn-robotics[robot]"'
         ) from exc
     api, name = api_of(args.map, args.token)
-    with ExitStack() as open_parts:
+    with _ended_by_sigterm(), ExitStack() as open_parts:
         open_parts.enter_context(api)
         followed = FollowedMap(api, name)
         # Checked before a file is begun: a band is of the map's voxels.
@@ -99,7 +104,7 @@ def _run(args: argparse.Namespace) -> int:
         if args.mcap is not None:
             file = McapFile(args.mcap)
             # After it is closed, also by Ctrl-C, which is how a file that follows a map ends.
-            open_parts.callback(lambda: say(f"{file.path}: {file.count} messages, {_shown_size(file.path)}"))
+            open_parts.callback(_say_written, file)
             sinks.append(open_parts.enter_context(file))
         choice = FloorChoice(ground_m=args.ground, band_m=args.band, frame=args.frame)
         publisher = MapPublisher(api, followed, sinks, choice)
@@ -108,6 +113,33 @@ def _run(args: argparse.Namespace) -> int:
         else:
             _follow(api, followed, publisher, args)
     return 0
+
+
+def _check_options(args: argparse.Namespace) -> None:
+    """Refuse options that would do nothing.
+
+    Raises:
+        BadInputError: kind `nothing_asked`, `bad_option`.
+    """
+    if args.foxglove is None and args.mcap is None:
+        raise BadInputError("nothing_asked", "say where to publish: --foxglove PORT, or --mcap FILE")
+    if args.changes is not None and (args.changes < 1 or not (args.follow or args.foxglove is not None)):
+        raise BadInputError("bad_option", "--changes N, 1 or more, is for a map that is followed: give --follow, too")
+    if args.origin and args.foxglove is None:
+        raise BadInputError("bad_option", "--origin is about viewers: give --foxglove PORT, too")
+
+
+@contextmanager
+def _ended_by_sigterm() -> Iterator[None]:
+    """Let SIGTERM end the block as Ctrl-C does, so that a file gets its index; only the main thread has signals."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _publish_once(api: MapApi, followed: "FollowedMap", publisher: "MapPublisher", args: argparse.Namespace) -> None:
@@ -162,8 +194,9 @@ def _follow(api: MapApi, followed: "FollowedMap", publisher: "MapPublisher", arg
                 return
 
 
-def _shown_size(path: Path) -> str:
-    return shown_bytes(path.stat().st_size)
+def _say_written(file: "McapFile") -> None:
+    if file.count:
+        say(f"{file.path}: {file.count} messages, {shown_bytes(file.path.stat().st_size)}")
 
 
 def _say_now(text: str) -> None:
