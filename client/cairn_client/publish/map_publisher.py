@@ -34,7 +34,7 @@ from cairn_fusion.ros.map_messages import (
 from cairn_map.errors import BadInputError, NotFoundError
 from cairn_map.evidence.grid import CellKey
 from cairn_map.evidence.voxels import Voxels, joined_voxels, voxels_of_evidence
-from cairn_map.queries.floor_grid import Band
+from cairn_map.queries.floor_grid import Band, FloorGrid
 from cairn_map.queries.map_snapshot import MapSnapshot
 from cairn_map.wire.messages import RobotStatus
 
@@ -179,26 +179,26 @@ class MapPublisher:
         way.is_new = False
 
     def _publish_floor(self, snapshot: MapSnapshot, now_ns: int) -> None:
-        if self._choice.ground_m is None:
-            self.ground_m = self._largest_ground(snapshot)
-        if self.ground_m is None:
-            return
-        grid = snapshot.floor_grid(ground_m=self.ground_m, band_m=self._choice.band_m)
-        if grid.values.size:
+        grid = self._floor_of(snapshot)
+        if grid is not None and grid.values.size:
             self._send(grid_message("/map", grid, self._choice.frame, now_ns))
 
-    def _largest_ground(self, snapshot: MapSnapshot) -> float | None:
-        """Height of the ground in use, until another storey is `STOREY_RATIO` times as large; None: none is free."""
+    def _floor_of(self, snapshot: MapSnapshot) -> FloorGrid | None:
+        """Floor of the storey in use, until another one is `STOREY_RATIO` times as large; None: none is free."""
         band_m = self._choice.band_m
+        used = None if self.ground_m is None else snapshot.floor_grid(ground_m=self.ground_m, band_m=band_m)
+        if self._choice.ground_m is not None:
+            return used
+        if used is not None and STOREY_RATIO * used.free_m2 > used.values.size * used.edge_m**2:
+            return used  # no storey is larger than all columns: most changes need no search for one
         try:
-            largest_m, free_m2 = snapshot.grounds(band_m=band_m)[0]
+            ground_m, free_m2 = snapshot.grounds(band_m=band_m)[0]
         except NotFoundError:
-            return self.ground_m
-        if self.ground_m is not None:
-            used_m2 = snapshot.floor_grid(ground_m=self.ground_m, band_m=band_m).free_m2
-            if free_m2 < STOREY_RATIO * used_m2:
-                return self.ground_m
-        return largest_m
+            return used
+        if used is not None and free_m2 < STOREY_RATIO * used.free_m2:
+            return used
+        self.ground_m = ground_m
+        return snapshot.floor_grid(ground_m=ground_m, band_m=band_m)
 
     def _occupied_in(self, snapshot: MapSnapshot, keys: Collection[CellKey]) -> list[Voxels]:
         """Occupied voxels of some cells, which are kept for the whole cloud."""
