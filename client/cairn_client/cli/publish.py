@@ -16,18 +16,26 @@ Topics, all in the frame `map` (--frame), lengths in metres, temperatures in deg
     /cairn/hot_spots            visualization_msgs/MarkerArray: the ten hottest places
     /cairn/octomap              octomap_msgs/Octomap: occupied and free space, once, with --octomap
     /tf                         tf2_msgs/TFMessage: robots that report where they are, each the frame of its name
-    /cairn/robots/NAME/path     nav_msgs/Path: the way of one, since publishing began
+    /cairn/robots/NAME/path     nav_msgs/Path: the way of one since publishing began, at most every 3 s
 
-A viewer that joins late gets the newest message of each topic at once. The server of --foxglove has no access control:
-it listens on this machine alone, unless another address is given (--foxglove 0.0.0.0:8766). For Nav2's map server
-there are files: `cairn map export URL --map-server NAME`.
+The storey of /map is that of --ground; without it the largest one, chosen again after each change, but left only for
+one with twice its free area. A viewer that joins late gets the newest message of each topic at once.
+
+A file is FILE.part until the command ends, at a change's number, by Ctrl-C or by SIGTERM; then it has its index.
+
+The server of --foxglove has no access control: it listens on this machine alone, unless another address is given
+(--foxglove 0.0.0.0:8766). Browsers' pages are refused but for Foxglove's own; --origin http://viewer:8080 lets those of
+a Lichtblick of your own in. For Nav2's map server there are files: `cairn map export URL --map-server NAME`.
 """
 
 import argparse
 import re
+import signal
 import sys
+import threading
 import time
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -42,8 +50,10 @@ from cairn_map.wire.live_events import CellsEvent, Hello, RobotHeard
 if TYPE_CHECKING:
     from cairn_client.publish.followed_map import FollowedMap
     from cairn_client.publish.map_publisher import MapPublisher
+    from cairn_client.publish.mcap_file import McapFile
 
 ADDRESS = re.compile(r"(?:(?P<host>[^\s:]+|\[[0-9a-fA-F:]+\]):)?(?P<port>\d{1,5})")
+ORIGIN = re.compile(r"https?://[^\s/]+/?", re.IGNORECASE)
 FRAME = re.compile(r"[A-Za-z][\w./-]{0,63}")
 
 
@@ -53,6 +63,9 @@ def add_parser(commands: Subparsers) -> None:
     publish = commands.add_parser("publish", help=text, description=__doc__)
     publish.add_argument("map", help="http://HOST:PORT/maps/NAME")
     publish.add_argument("--foxglove", type=_address, metavar="[HOST:]PORT", help="serve viewers here (0: a free port)")
+    publish.add_argument(
+        "--origin", action="append", default=[], type=_origin, metavar="URL", help="pages of this origin may join, too"
+    )
     publish.add_argument("--mcap", type=Path, metavar="FILE", help="write the messages into a file")
     publish.add_argument("--follow", action="store_true", help="go on with each change; with --foxglove it does")
     publish.add_argument("--changes", type=int, metavar="N", help="end after so many changes, the first state included")
@@ -64,8 +77,7 @@ def add_parser(commands: Subparsers) -> None:
 
 
 def _run(args: argparse.Namespace) -> int:
-    if args.foxglove is None and args.mcap is None:
-        raise BadInputError("nothing_asked", "say where to publish: --foxglove PORT, or --mcap FILE")
+    _check_options(args)
     try:
         from cairn_client.publish.followed_map import FollowedMap
         from cairn_client.publish.foxglove_server import FoxgloveServer
@@ -76,7 +88,7 @@ def _run(args: argparse.Namespace) -> int:
             "missing_extra", f'publishing needs {exc.name}: pip install "cairn-robotics[robot]"'
         ) from exc
     api, name = api_of(args.map, args.token)
-    with ExitStack() as open_parts:
+    with _ended_by_sigterm(), ExitStack() as open_parts:
         open_parts.enter_context(api)
         followed = FollowedMap(api, name)
         # Checked before a file is begun: a band is of the map's voxels.
@@ -84,13 +96,15 @@ def _run(args: argparse.Namespace) -> int:
         sinks: list[Sink] = []
         if args.foxglove is not None:
             host, port = args.foxglove
-            server = open_parts.enter_context(FoxgloveServer(f"cairn: {name}", host=host, port=port))
+            server = open_parts.enter_context(
+                FoxgloveServer(f"cairn: {name}", host=host, port=port, origins=args.origin)
+            )
             sinks.append(server)
             _say_at_once(f'{name} at {server.url}: open it in Foxglove or Lichtblick ("Foxglove WebSocket")')
         if args.mcap is not None:
             file = McapFile(args.mcap)
             # After it is closed, also by Ctrl-C, which is how a file that follows a map ends.
-            open_parts.callback(lambda: say(f"{file.path}: {file.count} messages, {_shown_size(file.path)}"))
+            open_parts.callback(_say_written, file)
             sinks.append(open_parts.enter_context(file))
         choice = FloorChoice(ground_m=args.ground, band_m=args.band, frame=args.frame)
         publisher = MapPublisher(api, followed, sinks, choice)
@@ -99,6 +113,33 @@ def _run(args: argparse.Namespace) -> int:
         else:
             _follow(api, followed, publisher, args)
     return 0
+
+
+def _check_options(args: argparse.Namespace) -> None:
+    """Refuse options that would do nothing.
+
+    Raises:
+        BadInputError: kind `nothing_asked`, `bad_option`.
+    """
+    if args.foxglove is None and args.mcap is None:
+        raise BadInputError("nothing_asked", "say where to publish: --foxglove PORT, or --mcap FILE")
+    if args.changes is not None and (args.changes < 1 or not (args.follow or args.foxglove is not None)):
+        raise BadInputError("bad_option", "--changes N, 1 or more, is for a map that is followed: give --follow, too")
+    if args.origin and args.foxglove is None:
+        raise BadInputError("bad_option", "--origin is about viewers: give --foxglove PORT, too")
+
+
+@contextmanager
+def _ended_by_sigterm() -> Iterator[None]:
+    """Let SIGTERM end the block as Ctrl-C does, so that a file gets its index; only the main thread has signals."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _publish_once(api: MapApi, followed: "FollowedMap", publisher: "MapPublisher", args: argparse.Namespace) -> None:
@@ -133,12 +174,12 @@ def _follow(api: MapApi, followed: "FollowedMap", publisher: "MapPublisher", arg
                 publisher.publish_robot(event.robot.branch, event.robot.status)
             case _:
                 pass
-        if not followed.has_news:
-            publisher.publish_whole()
+        # After a link that broke no news may be left but what is not published yet.
+        if not (followed.has_news or publisher.is_behind or is_first):
+            publisher.publish_due()
             continue
         try:
-            changed = followed.fetch()
-            publisher.publish_changes(changed)
+            count = publisher.publish_changes(followed.fetch())
             if is_first and args.octomap:
                 publisher.publish_octree()
         except UnreachableError as exc:
@@ -146,15 +187,16 @@ def _follow(api: MapApi, followed: "FollowedMap", publisher: "MapPublisher", arg
             continue
         is_first = False
         ground = "no ground yet" if publisher.ground_m is None else f"ground at {publisher.ground_m:.2f} m"
-        _say_now(f"{len(changed)} cells: {ground}, published {time.monotonic() - heard_s:.2f} s after the news")
+        _say_now(f"{count} cells: {ground}, published {time.monotonic() - heard_s:.2f} s after the news")
         if left is not None:
             left -= 1
             if left <= 0:
                 return
 
 
-def _shown_size(path: Path) -> str:
-    return shown_bytes(path.stat().st_size)
+def _say_written(file: "McapFile") -> None:
+    if file.count:
+        say(f"{file.path}: {file.count} messages, {shown_bytes(file.path.stat().st_size)}")
 
 
 def _say_now(text: str) -> None:
@@ -172,6 +214,12 @@ def _address(text: str) -> tuple[str, int]:
     if not found or int(found["port"]) > 65_535:
         raise argparse.ArgumentTypeError(f"an address is PORT or HOST:PORT, such as 8766; got {text!r}")
     return (found["host"] or "127.0.0.1").strip("[]"), int(found["port"])
+
+
+def _origin(text: str) -> str:
+    if not ORIGIN.fullmatch(text):
+        raise argparse.ArgumentTypeError(f"an origin is http://HOST:PORT or https://HOST, got {text!r}")
+    return text.rstrip("/").lower()
 
 
 def _frame(text: str) -> str:

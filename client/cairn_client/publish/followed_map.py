@@ -26,9 +26,11 @@ class FollowedMap:
         self.info = api.map_info(name)
         self._whole = HistoryMap(self.info.layer, coding=coding_of(self.info.geometry))
         self._digests: dict[CellKey, str] = {}
-        """Digests of the cells as the index had them when they were fetched."""
+        """Digests of the cells that are as the index had them; a cell that changed since then has none."""
         self._waiting: set[CellKey] = set()
         """Cells of which a change was heard."""
+        self._fetched: set[CellKey] = set()
+        """Cells that came, and that no `fetch` has returned yet: the link broke before it ended."""
         self._is_any = True
         """True if any cell may have changed."""
         self.snapshot: MapSnapshot = snapshot_of(self._whole, self.info.sensor_model)
@@ -38,7 +40,11 @@ class FollowedMap:
         if event.cells == "many":
             self._is_any = True
         else:
-            self._waiting |= {cell_key((i, j, k)) for i, j, k, _ in event.cells}
+            heard = {cell_key((i, j, k)) for i, j, k, _ in event.cells}
+            self._waiting |= heard
+            # Else evidence that is taken out while the link is broken would stay: the index has the old digest again.
+            for key in heard:
+                self._digests.pop(key, None)
 
     def note_any(self) -> None:
         """Note that any cell may have changed: the listener missed something."""
@@ -50,7 +56,7 @@ class FollowedMap:
         return self._is_any or bool(self._waiting)
 
     def fetch(self) -> Collection[CellKey]:
-        """Fetch the cells that changed; their numbers, in order."""
+        """Fetch the cells that changed; their numbers, in order, with those that came before a link broke."""
         if self._is_any:
             entries = {cell_key(entry.cell): entry for entry in index_of(self._api, self.info.name).cells}
             # A cell without voxels that is not held is no news.
@@ -61,9 +67,11 @@ class FollowedMap:
             }
             self._digests |= {key: entries[key].digest for key in self._waiting & entries.keys()}
             self._is_any = False
-        changed = sorted(self._waiting)
-        for key in changed:
+        for key in sorted(self._waiting):
             download_into(self._whole, self._api, self.info, key, memory_bytes_max=standard_limit_bytes())
             self._waiting.discard(key)
+            self._fetched.add(key)
         self.snapshot = self.snapshot.refreshed(self._whole)
+        changed = sorted(self._fetched)
+        self._fetched.clear()
         return changed

@@ -5,7 +5,8 @@
     slow viewer   -->  of a topic the newest alone waits: it misses some, and costs no memory
 
 Foxglove and Lichtblick connect to it. There is no access control: it listens on loopback unless another host is given;
-beyond loopback every client that reaches the port sees the map.
+beyond loopback every program that reaches the port sees the map. Browsers say which page asks: pages of other origins
+than `ORIGINS` and those that are given are refused, so that a page of the web, open on the same machine, reads nothing.
 """
 
 import json
@@ -14,12 +15,13 @@ import socket
 import struct
 import threading
 import uuid
+from collections.abc import Sequence
 from types import TracebackType
 from typing import Any, Self
 
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import Server, ServerConnection, serve
-from websockets.typing import Subprotocol
+from websockets.typing import Origin, Subprotocol
 
 from cairn_fusion.ros.map_messages import MapMessage, definition_of
 from cairn_map.errors import BadInputError
@@ -28,6 +30,8 @@ log = logging.getLogger(__name__)
 
 SUBPROTOCOLS = [Subprotocol("foxglove.sdk.v1"), Subprotocol("foxglove.websocket.v1")]
 """The newer and the older name; the messages that are sent here are the same."""
+ORIGINS = (None, Origin("file://"), Origin("https://app.foxglove.dev"))
+"""Programs, the desktop viewers, which are pages of files, and Foxglove's page; `null` is any page in a frame."""
 MESSAGE_DATA = struct.Struct("<BIQ")
 """Operation 1, number of the subscription, nanoseconds; the message follows."""
 REQUEST_BYTES_MAX = 1 << 16
@@ -47,20 +51,26 @@ WARNING = 1
 class FoxgloveServer:
     """Server that shows the messages sent to it; `send` may be called by any thread.
 
+    Args:
+        name: shown to viewers.
+        host: name or address to listen on, IPv6 without brackets.
+        port: 0 for any that is free.
+        origins: origins (scheme://host:port) of further pages that may join.
+
     Raises:
         BadInputError: kind `bad_address`: the address cannot be listened on.
     """
 
-    def __init__(self, name: str, *, host: str = "127.0.0.1", port: int = 0) -> None:
+    def __init__(self, name: str, *, host: str = "127.0.0.1", port: int = 0, origins: Sequence[str] = ()) -> None:
         self._name = name
         self._session = uuid.uuid4().hex
         self._lock = threading.Lock()
         self._channels: dict[str, int] = {}
         self._latest: dict[int, MapMessage] = {}
         self._viewers: set[_Viewer] = set()
-        self._server = _listening(self._serve, host, port)
+        self._server = _listening(self._serve, host, port, origins)
         self.port: int = self._server.socket.getsockname()[1]
-        self.url = f"ws://{host}:{self.port}"
+        self.url = f"ws://{_shown_address(host, self.port)}"
         self._thread = threading.Thread(target=self._server.serve_forever, name="foxglove", daemon=True)
         self._thread.start()
 
@@ -87,6 +97,9 @@ class FoxgloveServer:
         """Send all viewers away, and stop listening."""
         with self._lock:
             viewers = list(self._viewers)
+        # All at once: one that takes nothing keeps its thread for SEND_TIME, and as long again to say goodbye.
+        for viewer in viewers:
+            viewer.stop()
         for viewer in viewers:
             viewer.finish()
         self._server.shutdown()
@@ -198,11 +211,15 @@ class _Viewer:
         """Begin to write."""
         self._writer.start()
 
-    def finish(self) -> None:
-        """End the connection, once all that waits is written, or is not taken."""
+    def stop(self) -> None:
+        """Begin to end the connection: nothing is written after what waits."""
         with self._has_news:
             self._is_stopped = True
             self._has_news.notify()
+
+    def finish(self) -> None:
+        """End the connection, once all that waits is written, or is not taken."""
+        self.stop()
         self._writer.join()
 
     def _write_all(self) -> None:
@@ -227,12 +244,14 @@ class _Viewer:
             return MESSAGE_DATA.pack(1, self._numbers[channel], message.time_ns) + message.data
 
 
-def _listening(handler: Any, host: str, port: int) -> Server:
+def _listening(handler: Any, host: str, port: int, origins: Sequence[str]) -> Server:
     try:
         return serve(
             handler,
             host,
             port,
+            family=socket.AF_INET6 if ":" in host else socket.AF_INET,
+            origins=[*ORIGINS, *map(Origin, origins)],
             subprotocols=SUBPROTOCOLS,
             compression=None,  # a cloud of megabytes would take longer to pack than to send
             max_size=REQUEST_BYTES_MAX,
@@ -241,8 +260,13 @@ def _listening(handler: Any, host: str, port: int) -> Server:
     except (OSError, OverflowError) as exc:
         said = exc.strerror if isinstance(exc, OSError) and exc.strerror else str(exc)
         raise BadInputError(
-            "bad_address", f"cannot listen on {host}:{port}: {said}; give another port, or 0 for any that is free"
+            "bad_address",
+            f"cannot listen on {_shown_address(host, port)}: {said}; give another port, or 0 for any that is free",
         ) from exc
+
+
+def _shown_address(host: str, port: int) -> str:
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
 def _silence() -> logging.Logger:

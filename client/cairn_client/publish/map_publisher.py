@@ -8,18 +8,19 @@ Topics:
 /cairn/hot_spots            visualization_msgs/MarkerArray: the hottest places
 /cairn/octomap              octomap_msgs/Octomap: occupied and free space, once, where it is asked for
 /tf                         tf2_msgs/TFMessage: where robots are, each the frame of its name
-/cairn/robots/NAME/path     nav_msgs/Path: the way of one, since publishing began
+/cairn/robots/NAME/path     nav_msgs/Path: the way of one since publishing began, a pose every 5 cm, at most every 3 s
 """
 
+import math
 import time
-from collections import deque
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 from cairn_client.http.api import MapApi
 from cairn_client.publish.followed_map import FollowedMap
 from cairn_fusion.ros.map_messages import (
+    TIME_S_MAX,
     HotSpot,
     MapMessage,
     RobotPose,
@@ -33,17 +34,23 @@ from cairn_fusion.ros.map_messages import (
 from cairn_map.errors import BadInputError, NotFoundError
 from cairn_map.evidence.grid import CellKey
 from cairn_map.evidence.voxels import Voxels, joined_voxels, voxels_of_evidence
-from cairn_map.queries.floor_grid import Band
+from cairn_map.queries.floor_grid import Band, FloorGrid
 from cairn_map.queries.map_snapshot import MapSnapshot
 from cairn_map.wire.messages import RobotStatus
 
 HOT_SPOTS = 10
 WHOLE_S = 10.0
 """Shortest time between two clouds of all voxels: they may be megabytes."""
-POSES_MAX = 10_000
-"""Poses of a path; older ones are dropped."""
+PATH_S = 3.0
+"""Shortest time between two messages of a robot's path: each holds the whole way."""
+STEP_M = 0.05
+"""Distance between poses of a path, until it is long."""
+POSES_MAX = 2000
+"""Poses of a path, even; one that grows longer keeps every second pose, and goes on with steps of twice the length."""
 ROBOTS_MAX = 1000
 TREE_BYTES_MAX = 256 << 20
+STOREY_RATIO = 2.0
+"""Free area of a storey that is published in another one's place, as a multiple of that one's: tables come and go."""
 
 
 class Sink(Protocol):
@@ -59,7 +66,7 @@ class FloorChoice:
     """Storey that is published, and the robot that drives on it."""
 
     ground_m: float | None
-    """None: that of the largest storey, once there is one."""
+    """None: that of the largest storey, until another one has twice its free area."""
     band_m: Band | None
     frame: str
     """Frame of all messages: the map's."""
@@ -68,35 +75,64 @@ class FloorChoice:
 class MapPublisher:
     """Publisher of a followed map; not thread-safe."""
 
-    def __init__(self, api: MapApi, followed: FollowedMap, sinks: Sequence[Sink], choice: FloorChoice) -> None:
+    def __init__(
+        self,
+        api: MapApi,
+        followed: FollowedMap,
+        sinks: Sequence[Sink],
+        choice: FloorChoice,
+        *,
+        steady_s: Callable[[], float] = time.monotonic,
+    ) -> None:
         self._api = api
         self._followed = followed
         self._sinks = sinks
         self._choice = choice
+        self._steady_s = steady_s
         self.ground_m = choice.ground_m
         self._occupied: dict[CellKey, Voxels] = {}
         """Occupied voxels by cell; cells without any are left out."""
-        self._whole_due_s = 0.0
+        self._unpublished: set[CellKey] = set()
+        """Changed cells whose publishing has not ended yet."""
+        self._whole_due_s = -math.inf
         self._is_whole_new = False
-        self._paths: dict[str, deque[RobotPose]] = {}
+        self._ways: dict[str, _Way] = {}
 
-    def publish_changes(self, changed: Collection[CellKey]) -> None:
-        """Publish what the change of some cells makes new: first the floor, which robots drive by."""
+    @property
+    def is_behind(self) -> bool:
+        """True if the link broke while a change was published: `publish_changes` goes on with it."""
+        return bool(self._unpublished)
+
+    def publish_changes(self, changed: Collection[CellKey]) -> int:
+        """Publish what the change of some cells makes new: first the floor, which robots drive by.
+
+        Returns:
+            Number of cells, with those whose publishing a broken link ended before.
+        """
+        self._unpublished |= set(changed)
         snapshot, frame, now_ns = self._followed.snapshot, self._choice.frame, time.time_ns()
         self._publish_floor(snapshot, now_ns)
-        parts = self._occupied_in(snapshot, changed)
+        parts = self._occupied_in(snapshot, sorted(self._unpublished))
         self._send(cloud_message("/cairn/changed_points", _joined(parts, snapshot), frame, now_ns))
         self._is_whole_new = True
-        self.publish_whole()
+        self._publish_whole()
         self._publish_hot_spots(now_ns)
+        count = len(self._unpublished)
+        self._unpublished.clear()
+        return count
 
-    def publish_whole(self) -> None:
-        """Publish the cloud of all occupied voxels, if it changed and the last one is long enough ago."""
-        if not self._is_whole_new or time.monotonic() < self._whole_due_s:
+    def publish_due(self) -> None:
+        """Publish the cloud of all occupied voxels and the paths that changed, if the last ones are long enough ago."""
+        self._publish_whole()
+        for name in self._ways:
+            self._publish_path(name)
+
+    def _publish_whole(self) -> None:
+        if not self._is_whole_new or self._steady_s() < self._whole_due_s:
             return
         whole = _joined(list(self._occupied.values()), self._followed.snapshot)
         self._send(cloud_message("/cairn/points", whole, self._choice.frame, time.time_ns()))
-        self._whole_due_s = time.monotonic() + WHOLE_S
+        self._whole_due_s = self._steady_s() + WHOLE_S
         self._is_whole_new = False
 
     def publish_octree(self) -> None:
@@ -111,32 +147,58 @@ class MapPublisher:
         self._send(octomap_message("/cairn/octomap", tree, edge_m, self._choice.frame, time.time_ns()))
 
     def publish_robot(self, name: str, status: RobotStatus | None) -> None:
-        """Publish where a robot says it is, and its way so far."""
-        if status is None or status.pose is None or (name not in self._paths and len(self._paths) >= ROBOTS_MAX):
+        """Publish where a robot says it is, and its way so far; nothing at a time that no message of ROS 2 can hold."""
+        if status is None or status.pose is None or not 0 <= status.pose.time_s <= TIME_S_MAX:
             return
         pose = RobotPose(status.pose.time_s, status.pose.t_map_rig, status.pose.q_map_rig)
-        path = self._paths.setdefault(name, deque(maxlen=POSES_MAX))
-        if path and path[-1] == pose:
+        way = self._ways.get(name)
+        if way is None:
+            if len(self._ways) >= ROBOTS_MAX:
+                return
+            self._ways[name] = _Way(pose)
+        elif way.newest == pose:
             return
-        path.append(pose)
-        now_ns, frame = time.time_ns(), self._choice.frame
+        else:
+            way.add(pose)
         # Of all robots, so that one who joins later finds them all in the last message.
-        self._send(transforms_message("/tf", {robot: way[-1] for robot, way in self._paths.items()}, frame, now_ns))
-        self._send(path_message(f"/cairn/robots/{name}/path", list(path), frame, now_ns))
+        newest = {robot: way.newest for robot, way in self._ways.items()}
+        self._send(transforms_message("/tf", newest, self._choice.frame, time.time_ns()))
+        self._publish_path(name)
 
     def forget_robot(self, name: str) -> None:
         """Forget a robot that left the map."""
-        self._paths.pop(name, None)
+        self._ways.pop(name, None)
+
+    def _publish_path(self, name: str) -> None:
+        way = self._ways[name]
+        if not way.is_new or self._steady_s() < way.due_s:
+            return
+        poses = way.poses if way.poses[-1] == way.newest else [*way.poses, way.newest]
+        self._send(path_message(f"/cairn/robots/{name}/path", poses, self._choice.frame, time.time_ns()))
+        way.due_s = self._steady_s() + PATH_S
+        way.is_new = False
 
     def _publish_floor(self, snapshot: MapSnapshot, now_ns: int) -> None:
-        if self.ground_m is None:
-            try:
-                self.ground_m = snapshot.grounds(band_m=self._choice.band_m)[0][0]
-            except NotFoundError:
-                return
-        grid = snapshot.floor_grid(ground_m=self.ground_m, band_m=self._choice.band_m)
-        if grid.values.size:
+        grid = self._floor_of(snapshot)
+        if grid is not None and grid.values.size:
             self._send(grid_message("/map", grid, self._choice.frame, now_ns))
+
+    def _floor_of(self, snapshot: MapSnapshot) -> FloorGrid | None:
+        """Floor of the storey in use, until another one is `STOREY_RATIO` times as large; None: none is free."""
+        band_m = self._choice.band_m
+        used = None if self.ground_m is None else snapshot.floor_grid(ground_m=self.ground_m, band_m=band_m)
+        if self._choice.ground_m is not None:
+            return used
+        if used is not None and STOREY_RATIO * used.free_m2 > used.values.size * used.edge_m**2:
+            return used  # no storey is larger than all columns: most changes need no search for one
+        try:
+            ground_m, free_m2 = snapshot.grounds(band_m=band_m)[0]
+        except NotFoundError:
+            return used
+        if used is not None and free_m2 < STOREY_RATIO * used.free_m2:
+            return used
+        self.ground_m = ground_m
+        return snapshot.floor_grid(ground_m=ground_m, band_m=band_m)
 
     def _occupied_in(self, snapshot: MapSnapshot, keys: Collection[CellKey]) -> list[Voxels]:
         """Occupied voxels of some cells, which are kept for the whole cloud."""
@@ -167,6 +229,30 @@ class MapPublisher:
     def _send(self, message: MapMessage) -> None:
         for sink in self._sinks:
             sink.send(message)
+
+
+class _Way:
+    """Way of a robot: its newest pose, and poses some steps apart."""
+
+    def __init__(self, pose: RobotPose) -> None:
+        self.newest = pose
+        self.poses = [pose]
+        self.is_new = True
+        """True if the way grew since it was published."""
+        self.due_s = -math.inf
+        """Time from which on it may be published again, of the publisher's clock."""
+        self._step_m = STEP_M
+
+    def add(self, pose: RobotPose) -> None:
+        """Go on to a pose; one less than a step from the last of the way is the newest alone."""
+        self.newest = pose
+        if math.dist(self.poses[-1].t_map_rig, pose.t_map_rig) < self._step_m:
+            return
+        self.poses.append(pose)
+        self.is_new = True
+        if len(self.poses) > POSES_MAX:
+            del self.poses[1::2]
+            self._step_m *= 2
 
 
 def _joined(parts: list[Voxels], snapshot: MapSnapshot) -> Voxels:

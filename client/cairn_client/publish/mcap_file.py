@@ -11,16 +11,23 @@ from cairn_map.errors import BadInputError
 
 
 class McapFile:
-    """MCAP file that grows message by message; it has its index once it is closed.
+    """MCAP file that grows message by message, for a `with` block: at its end it gets its index, and its name.
+
+    Until then messages go into FILE.part, and what was there under the name stays. An error leaves FILE.part with its
+    index; without a message no file is left.
 
     Raises:
         BadInputError: kind `bad_output`: the file cannot be written.
     """
 
     def __init__(self, path: Path) -> None:
-        self.path = path
+        self._whole_path = path
+        if path.is_dir():
+            raise BadInputError("bad_output", f"cannot write {path}: it is a folder")
+        self.path = path.with_name(f"{path.name}.part")
+        """Place of the messages."""
         try:
-            self._file = path.open("wb")
+            self._file = self.path.open("wb")
         except OSError as exc:
             raise BadInputError("bad_output", f"cannot write {path}: {exc.strerror}") from exc
         self._writer = Writer(self._file)
@@ -35,7 +42,13 @@ class McapFile:
     def __exit__(
         self, kind: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        self.close()
+        self._writer.finish()  # type: ignore[no-untyped-call]
+        self._file.close()
+        if not self.count:
+            self.path.unlink()
+        elif exc is None or isinstance(exc, KeyboardInterrupt):
+            # Ctrl-C is how a file that follows a map ends.
+            self.path = self.path.replace(self._whole_path)
 
     @property
     def count(self) -> int:
@@ -51,12 +64,6 @@ class McapFile:
         self._writer.add_message(
             self._channels[topic], message.time_ns, message.data, message.time_ns, self._counts[topic]
         )
-
-    def close(self) -> None:
-        """Write the index, and close the file."""
-        if not self._file.closed:
-            self._writer.finish()  # type: ignore[no-untyped-call]
-            self._file.close()
 
     def _schema_of(self, type_name: str) -> int:
         if type_name not in self._schemas:

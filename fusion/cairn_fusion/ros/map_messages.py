@@ -41,6 +41,8 @@ UNCOLOURED = 0x808080
 """Grey, for voxels that no colour camera saw."""
 SPOT_M = 0.15
 """Diameter of a hot spot's marker, and height of its text."""
+TIME_S_MAX = 2**31 - 1
+"""Latest time of a message, UTC seconds since 1970: `builtin_interfaces/Time` has 32 bits with a sign."""
 TREE_DATA = b"\ndata\n"
 """End of the head of OctoMap's files."""
 
@@ -60,6 +62,7 @@ class RobotPose(NamedTuple):
     """Pose of a robot's rig in the map, with its time."""
 
     time_s: float
+    """UTC seconds since 1970, 0 to `TIME_S_MAX`."""
     t_map_rig: Sequence[float]
     q_map_rig: Sequence[float]
     """x y z w."""

@@ -21,7 +21,13 @@ OCCUPIED_THRESHOLD, FREE_THRESHOLD = 0.65, 0.196
 
 
 def map_files(stem: Path) -> tuple[Path, Path]:
-    """Places of the picture and of its description, of a map of this name."""
+    """Places of the picture and of its description, of a map of this name.
+
+    Raises:
+        BadInputError: kind `bad_output`: a folder is no name.
+    """
+    if stem.name in ("", ".."):
+        raise BadInputError("bad_output", f"a map's files need a name, such as floor1; got {str(stem)!r}")
     return stem.with_name(f"{stem.name}.pgm"), stem.with_name(f"{stem.name}.yaml")
 
 

@@ -1,11 +1,13 @@
 """Foxglove's protocol over loopback: who joins late, who is slow, who asks for nonsense."""
 
+import socket
+import threading
 from collections.abc import Iterator
 from contextlib import ExitStack
 
 import pytest
 from tests.fixtures.client.foxglove_viewer import WAIT_S, FoxgloveViewer
-from websockets.exceptions import ConnectionClosed
+from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from cairn_client.publish.foxglove_server import CLIENTS_MAX, REQUEST_BYTES_MAX, FoxgloveServer
 from cairn_fusion.ros.map_messages import GRID, PATH, MapMessage
@@ -142,3 +144,86 @@ def test_all_that_was_sent_before_the_end_arrives() -> None:
 def test_a_port_that_is_used_is_said(shown: FoxgloveServer) -> None:
     with pytest.raises(BadInputError, match=f"cannot listen on 127.0.0.1:{shown.port}: .*another port"):
         FoxgloveServer("lab", port=shown.port)
+
+
+@pytest.mark.parametrize(
+    ("origin", "is_let_in"),
+    [
+        (None, True),
+        ("file://", True),
+        ("https://app.foxglove.dev", True),
+        ("http://viewer:8080", True),
+        ("http://viewer:8081", False),
+        ("https://evil.example", False),
+        ("https://app.foxglove.dev.evil.example", False),
+        ("http://127.0.0.1:8766", False),
+        ("null", False),
+    ],
+)
+def test_a_page_in_a_browser_joins_if_its_origin_is_named(origin: str | None, is_let_in: bool) -> None:
+    with FoxgloveServer("lab", origins=["http://viewer:8080"]) as server:
+        if is_let_in:
+            with FoxgloveViewer(server.url, origin=origin) as viewer:
+                assert viewer.info["name"] == "lab"
+        else:
+            with pytest.raises(InvalidStatus, match="403"):
+                FoxgloveViewer(server.url, origin=origin)
+
+
+def test_an_address_of_ipv6_stands_in_brackets() -> None:
+    try:
+        server = FoxgloveServer("lab", host="::1")
+    except BadInputError as exc:
+        assert exc.message.startswith("cannot listen on [::1]:0: ")  # a machine without IPv6
+        return
+    with server, FoxgloveViewer(server.url) as viewer:
+        assert server.url == f"ws://[::1]:{server.port}"
+        assert viewer.info["name"] == "lab"
+
+
+def test_viewers_that_do_not_say_goodbye_are_sent_away_together(shown: FoxgloveServer) -> None:
+    """One after the other the second one's goodbye would come after the first one's connection was given up."""
+    with ExitStack() as connections:
+        viewers = [connections.enter_context(silent_viewer(shown.port)) for _ in range(2)]
+        closing = threading.Thread(target=shown.close)
+        closing.start()
+        for viewer in viewers:
+            assert read_until(viewer, GOODBYE)
+        for viewer in viewers:
+            viewer.setblocking(False)
+            with pytest.raises(BlockingIOError):
+                viewer.recv(1)
+    closing.join(WAIT_S)
+    assert not closing.is_alive()
+
+
+GOODBYE = b"\x88\x02\x03\xe8"
+"""A close frame of RFC 6455: code 1000, no reason."""
+
+
+def silent_viewer(port: int) -> socket.socket:
+    """A viewer that joins, and then says nothing: no goodbye either."""
+    connection = socket.create_connection(("127.0.0.1", port), WAIT_S)
+    head = (
+        "GET / HTTP/1.1",
+        "Host: 127.0.0.1",
+        "Upgrade: websocket",
+        "Connection: Upgrade",
+        "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==",
+        "Sec-WebSocket-Version: 13",
+        "Sec-WebSocket-Protocol: foxglove.sdk.v1",
+    )
+    connection.sendall("".join(f"{line}\r\n" for line in (*head, "")).encode())
+    assert read_until(connection, b"advertise")
+    return connection
+
+
+def read_until(connection: socket.socket, mark: bytes) -> bool:
+    """Read on until a mark; False: the connection ended before."""
+    came = b""
+    while mark not in came:
+        part = connection.recv(1)
+        if not part:
+            return False
+        came += part
+    return True

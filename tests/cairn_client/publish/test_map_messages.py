@@ -1,5 +1,6 @@
 """Messages of maps, read by the definitions that go with them, and by this project's own reader of bags."""
 
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from cairn_fusion.ros.map_messages import HotSpot, MapMessage, RobotPose
 from cairn_fusion.ros.mcap_bag import McapBag
 from cairn_fusion.ros.messages import read_transforms
 from cairn_fusion.ros.point_clouds import read_points
-from cairn_map.errors import BadInputError, DamagedDataError
+from cairn_map.errors import BadInputError, DamagedDataError, UnreachableError
 from cairn_map.queries.floor_grid import FloorGrid
 from cairn_map.queries.map_snapshot import snapshot_of
 
@@ -136,6 +137,42 @@ def test_a_file_gives_every_message_back_to_two_readers(tmp_path: Path) -> None:
             assert read_message(schema.data.decode(), schema.name, record.data)
 
 
-def test_a_file_that_cannot_be_written_is_said(tmp_path: Path) -> None:
+@pytest.mark.parametrize("ending", [None, KeyboardInterrupt])
+def test_a_file_takes_the_place_of_another_once_it_is_whole(tmp_path: Path, ending: type[BaseException] | None) -> None:
+    path = tmp_path / "lab.mcap"
+    path.write_bytes(b"old")
+    with suppress(KeyboardInterrupt), McapFile(path) as file:
+        file.send(all_messages()[0])
+        assert path.read_bytes() == b"old"
+        if ending is not None:
+            raise ending
+    assert (file.path, count_in(path), list(tmp_path.iterdir())) == (path, 1, [path])
+
+
+def test_an_error_leaves_what_came_next_to_the_file_that_was_there(tmp_path: Path) -> None:
+    path = tmp_path / "lab.mcap"
+    path.write_bytes(b"old")
+    with pytest.raises(UnreachableError), McapFile(path) as file:
+        file.send(all_messages()[0])
+        raise UnreachableError("unreachable", "gone")
+    assert (path.read_bytes(), file.path.name, count_in(file.path)) == (b"old", "lab.mcap.part", 1)
+
+
+def test_a_file_without_a_message_is_none(tmp_path: Path) -> None:
+    with pytest.raises(UnreachableError), McapFile(tmp_path / "lab.mcap"):
+        raise UnreachableError("unreachable", "gone")
+    assert not list(tmp_path.iterdir())
+
+
+def count_in(path: Path) -> int:
+    """Number of messages, by the file's index."""
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None and summary.statistics is not None
+    return summary.statistics.message_count
+
+
+@pytest.mark.parametrize("name", ["nowhere/lab.mcap", "."])
+def test_a_file_that_cannot_be_written_is_said(tmp_path: Path, name: str) -> None:
     with pytest.raises(BadInputError, match="cannot write"):
-        McapFile(tmp_path / "nowhere" / "lab.mcap")
+        McapFile(tmp_path / name)

@@ -1,19 +1,21 @@
 """`cairn map publish`: a map as messages in a file, and live to a viewer, by the lines that a user types."""
 
+import io
+import queue
+import signal
 import threading
-from collections.abc import Callable
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import numpy as np
 import pytest
 from mcap.reader import make_reader
 from tests.fixtures.client.floors import SIDE, push_storey
-from tests.fixtures.client.foxglove_viewer import FoxgloveViewer
+from tests.fixtures.client.foxglove_viewer import WAIT_S, FoxgloveViewer
 from tests.fixtures.client.live_server import LiveServer
 from tests.fixtures.client.made import MAP, A
 from tests.fixtures.fusion.cdr_reader import read_message
-from tests.fixtures.server.live import free_port
 
 from cairn_client.cli.maps.command import main
 from cairn_client.http.api import MapApi
@@ -68,50 +70,75 @@ def test_a_file_holds_floor_voxels_hot_spots_octree_and_robots(
 
 
 def test_a_change_reaches_a_viewer_and_who_joins_late_gets_the_latest_floor(
-    server: LiveServer, tmp_path: Path, until: Callable[[Callable[[], bool]], None]
+    server: LiveServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     push_storey(server, tmp_path / "mole")
-    port, ended = free_port("127.0.0.1"), list[int]()
-    words = [
-        "publish",
-        server.map_url,
-        "--foxglove",
-        str(port),
-        "--mcap",
-        str(tmp_path / "a.mcap"),
-        "--changes=3",
-        BAND,
-    ]
+    lines, ended = Lines(), list[int]()
+    monkeypatch.setattr("sys.stdout", lines)
+    words = ["publish", server.map_url, "--foxglove=0", f"--mcap={tmp_path / 'a.mcap'}", "--changes=3", BAND]
     publishing = threading.Thread(target=lambda: ended.append(main(words)), daemon=True)
     publishing.start()
-    with joined(port, until) as viewer:
+    url = lines.next_with("ws://").split()[2].rstrip(":")
+    with FoxgloveViewer(url) as viewer:
         viewer.subscribe("/map")
         np.testing.assert_array_equal(viewer.next_message()["data"], floor(None))
         push_storey(server, tmp_path / "mole", wall_x=2)
         np.testing.assert_array_equal(viewer.next_message()["data"], floor(2))
-        with joined(port, until) as late:
+        with FoxgloveViewer(url) as late:
             late.subscribe("/map")
             np.testing.assert_array_equal(late.next_message()["data"], floor(2))
         push_storey(server, tmp_path / "mole", wall_x=5)
         assert (viewer.next_message()["data"] == 100).sum() == 2 * SIDE
-    publishing.join()
+    publishing.join(WAIT_S)
     assert ended == [0]
     # A file that is followed has the floor after each change; the cloud of all at first, since the rest came soon.
     assert (messages_of(tmp_path / "a.mcap")["/map"]["data"] == 100).sum() == 2 * SIDE
 
 
-def joined(port: int, until: Callable[[Callable[[], bool]], None]) -> FoxgloveViewer:
-    found: list[FoxgloveViewer] = []
+class Lines(io.TextIOBase):
+    """Standard output of a command in another thread, line by line."""
 
-    def is_there() -> bool:
-        try:
-            found.append(FoxgloveViewer(f"ws://127.0.0.1:{port}"))
-        except ConnectionRefusedError:
-            return False
-        return True
+    def __init__(self) -> None:
+        self._lines: queue.SimpleQueue[str] = queue.SimpleQueue()
 
-    until(is_there)
-    return found[0]
+    def write(self, text: str) -> int:
+        self._lines.put(text)
+        return len(text)
+
+    def next_with(self, part: str) -> str:
+        """The next line that holds a text."""
+        while part not in (line := self._lines.get(timeout=WAIT_S)):
+            pass
+        return line
+
+
+def test_sigterm_ends_a_file_as_ctrl_c_does(
+    server: LiveServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    push_storey(server, tmp_path / "mole")
+    lines, path = Lines(), tmp_path / "a.mcap"
+    monkeypatch.setattr("sys.stdout", lines)
+    main_thread = threading.main_thread().ident
+    assert main_thread is not None
+
+    def end() -> None:
+        lines.next_with("1 cells: ")
+        signal.pthread_kill(main_thread, signal.SIGTERM)
+
+    def fail(number: int, frame: FrameType | None) -> None:
+        raise AssertionError("the command does not mind the signal")
+
+    before = signal.signal(signal.SIGTERM, fail)
+    try:
+        ending = threading.Thread(target=end, daemon=True)
+        ending.start()
+        with pytest.raises(KeyboardInterrupt):
+            main(["publish", server.map_url, f"--mcap={path}", "--follow", BAND])
+        ending.join(WAIT_S)
+        assert signal.getsignal(signal.SIGTERM) is fail
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    np.testing.assert_array_equal(messages_of(path)["/map"]["data"], floor(None))
 
 
 def test_a_followed_map_fetches_what_changed_alone_and_equals_the_servers(server: LiveServer, tmp_path: Path) -> None:
@@ -158,6 +185,9 @@ def test_a_map_without_ground_is_published_without_a_floor(server: LiveServer, t
         (["--mcap=a.mcap", "--band=0.01,1"], "at least a voxel"),
         (["--mcap=nowhere/a.mcap"], "cannot write"),
         (["--foxglove=203.0.113.7:1"], "another port"),
+        (["--mcap=a.mcap", "--changes=2"], "give --follow"),
+        (["--mcap=a.mcap", "--follow", "--changes=0"], "1 or more"),
+        (["--mcap=a.mcap", "--origin=http://viewer:8080"], "give --foxglove"),
     ],
 )
 def test_what_cannot_be_published_is_said(
@@ -166,16 +196,18 @@ def test_what_cannot_be_published_is_said(
     monkeypatch.chdir(tmp_path)
     with pytest.raises(BadInputError, match=said):
         main(["publish", server.map_url, *words])
-    assert not list(tmp_path.glob("*.mcap"))
+    assert not list(tmp_path.glob("*.mcap*"))
 
 
 def test_a_map_that_is_not_there_is_said(server: LiveServer, tmp_path: Path) -> None:
     with pytest.raises(NotFoundError):
         main(["publish", f"{server.url}/maps/nothing", f"--mcap={tmp_path / 'a.mcap'}"])
-    assert not list(tmp_path.glob("*.mcap"))
+    assert not list(tmp_path.glob("*.mcap*"))
 
 
-@pytest.mark.parametrize("words", [["--foxglove=http://a"], ["--foxglove=70000"], ["--frame=a b", "--mcap=a"]])
+@pytest.mark.parametrize(
+    "words", [["--foxglove=http://a"], ["--foxglove=70000"], ["--frame=a b", "--mcap=a"], ["--origin=viewer"]]
+)
 def test_addresses_and_frames_are_checked(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         main(["publish", "http://127.0.0.1:9/maps/lab", *words])
