@@ -115,7 +115,7 @@ def head_of(opened: KeptFolder, plan: MovePlan, given: Rig | None, *, of: str | 
         raise NotFoundError(
             "no_scans",
             f"{opened.folder} keeps no scans, so no measurement of {opened.robot} can be moved: give --keep-scans MB "
-            "to `cairn robot run` or `replay` before they are mapped",
+            "to `cairn robot run`, `replay` or `live` before they are mapped",
         )
     heads = {form.rig: _rig_of(opened, form, given) for form, _ in plan.forms.values()}
     if of not in (None, RIG) and len(heads) > 1:

@@ -18,9 +18,10 @@ from cairn_fusion.ros.messages import plain_type
 from cairn_map.errors import DamagedDataError
 
 SUBPROTOCOLS = ("foxglove.sdk.v1", "foxglove.websocket.v1")
-TEXT_BYTES_MAX = 32 << 20
-"""Largest text frame: the schemas of some thousand channels."""
+TEXT_BYTES_MAX = 4 << 20
+"""Largest text frame: the schemas of a thousand channels. As objects of Python it may take 20 times that."""
 CHANNELS_MAX = 10_000
+"""Most channels of one frame, and of one bridge."""
 NAME_MAX = 1024
 MESSAGE_DATA = 1
 MESSAGE_HEAD = struct.Struct("<BIQ")

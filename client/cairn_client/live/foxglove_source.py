@@ -20,6 +20,7 @@ from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
 from cairn_client.live.foxglove_frames import (
+    CHANNELS_MAX,
     SUBPROTOCOLS,
     Advertised,
     BridgeInfo,
@@ -36,7 +37,8 @@ from cairn_map.errors import BadInputError, DamagedDataError
 
 log = logging.getLogger(__name__)
 
-MESSAGE_BYTES_MAX = 256 << 20
+MESSAGE_BYTES_MAX = 64 << 20
+"""Largest frame; a cloud of a million points with 48 bytes each has less."""
 FRAMES_MAX = 16
 """Frames that the library reads ahead; beyond them the bridge drops the oldest without a word."""
 CONNECT_S = 2.5
@@ -76,8 +78,7 @@ class FoxgloveSource:
         Raises:
             BadInputError: kind `bad_url`: it is none.
         """
-        parts = urlsplit(url)
-        if parts.scheme != "ws" or not parts.hostname:
+        if not _is_url(url):
             raise BadInputError(
                 "bad_url", f"a live source is the URL of a Foxglove bridge, ws://HOST:PORT; got {url!r}"
             )
@@ -236,6 +237,8 @@ class FoxgloveSource:
                 self._inbox.put(BagMessage(name, self._last_ns, data))
             case Advertised(channels=channels):
                 with self._lock:
+                    if len(self._channels.keys() | channels.keys()) > CHANNELS_MAX:
+                        raise DamagedDataError("bad_frame", f"a bridge offers at most {CHANNELS_MAX} channels")
                     self._channels |= channels
                 for channel, topic in channels.items():
                     if self._wanted(topic):
@@ -273,3 +276,14 @@ class FoxgloveSource:
             if not subscription.messages and now_s >= subscription.again_s:
                 pause_s = min(2 * subscription.pause_s, SILENT_AGAIN_MAX_S)
                 self._subscribe(link, subscription.channel, name, pause_s=pause_s)
+
+
+def _is_url(url: str) -> bool:
+    """True if this is ws://HOST:PORT, with a host and a port that there may be."""
+    try:
+        parts = urlsplit(url)
+        host, port = parts.hostname or "", parts.port
+        host.encode("idna")  # as the system's resolver will
+    except ValueError:
+        return False
+    return parts.scheme == "ws" and bool(host) and port != 0 and "\0" not in host

@@ -8,7 +8,7 @@ import threading
 from collections import Counter
 from collections.abc import Callable
 
-from cairn_fusion.ros.bag import BagMessage
+from cairn_fusion.ros.bag import HELD_BYTES, BagMessage
 
 BYTES_MAX = 256_000_000
 SMALL_BYTES = 1 << 16
@@ -38,7 +38,7 @@ class Inbox:
         """Add a message; the oldest images go if the bytes are used up."""
         with self._changed:
             self._waiting.append(message)
-            self._size_bytes += len(message.data)
+            self._size_bytes += len(message.data) + HELD_BYTES
             if self._size_bytes > self._bytes_max:
                 self._make_room(lambda size: size > SMALL_BYTES)
                 self._make_room(lambda size: True)
@@ -66,7 +66,7 @@ class Inbox:
         for message in self._waiting[:-1]:
             size = len(message.data)
             if self._size_bytes > LEFT_SHARE * self._bytes_max and may_go(size):
-                self._size_bytes -= size
+                self._size_bytes -= size + HELD_BYTES
                 self._dropped[message.topic] += 1
             else:
                 kept.append(message)

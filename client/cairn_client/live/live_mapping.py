@@ -3,7 +3,8 @@
     messages -> LiveScans -> backlog -> gate -> decode -> Robot.observe -> commit after 50 scans, 5 s or 2 m
 
 A robot that is slower than its cameras takes the newest scans: those that wait longer than a second go, and are
-counted. So arrived = taken + not moved + dropped + left out by cause + waiting, at any time.
+counted. So arrived = taken + not moved + dropped + left out by cause + waiting, at any time. Where the disk or the
+outbox is full, mapping goes on in the open measurement.
 """
 
 import logging
@@ -14,18 +15,24 @@ from collections.abc import Callable, Iterable
 from cairn_client.robot.robot import Robot
 from cairn_fusion.mapping.grouping import Grouping, OpenGroup
 from cairn_fusion.mapping.scan_gate import ScanGate
+from cairn_fusion.recording.scan import Scan
 from cairn_fusion.ros.bag import BagMessage
 from cairn_fusion.ros.live_scans import Cause, LiveScans, ReadyScan
 from cairn_fusion.ros.scan_decoder import ScanDecoder
 from cairn_map.codec.cell_code import Profile
-from cairn_map.errors import BadInputError, DamagedDataError, UnreachableError
+from cairn_map.errors import BadInputError, CairnError, DamagedDataError, UnreachableError
 
 log = logging.getLogger(__name__)
 
+TOO_LARGE = "too_large"
+"""Kind of the error of a measurement that can be no commit."""
 BEHIND_S = 1.0
 """Wait from which on a scan gives way to newer ones."""
 REST_S = 5.0
 """Time without a scan after which the open measurement is committed."""
+FINISH_S = 1.0
+"""Longest mapping of what waits at the end: a container is killed ten seconds after it is asked to stop, and the push
+may take eight of them."""
 
 
 class LiveMapping:
@@ -44,12 +51,12 @@ class LiveMapping:
         self.taken = 0
         """Scans that became evidence."""
         self.dropped = 0
-        """Scans that gave way to newer ones."""
+        """Scans that gave way to newer ones, or to the end, or for which there was no room."""
         self.commits = 0
         self.refusal = ""
         """Reason for which the last commit waits; empty: there is none."""
         self.newest_s = float("-inf")
-        """Stamp of the newest scan taken."""
+        """Stamp of the scan taken last."""
         self._robot = robot
         self._scans = scans
         self._decoder = decoder
@@ -58,6 +65,8 @@ class LiveMapping:
         self._steady_s = steady_s
         self._group = OpenGroup(Grouping())
         self._backlog: deque[ReadyScan] = deque()
+        self._open_scans = 0
+        """Scans of the open measurement."""
         self._last_scan_s: float | None = None
         """Steady time of the last scan of the open measurement; None: it is empty."""
 
@@ -95,9 +104,12 @@ class LiveMapping:
             self._commit()
 
     def finish(self) -> None:
-        """Map all that waits, and commit; no more messages come."""
-        for ready in (*self._backlog, *self._scans.ready(self._steady_s(), is_over=True)):
-            self._map(ready)
+        """Map what waits, as far as a second allows, and commit; no more messages come."""
+        end_s = self._steady_s() + FINISH_S
+        self._backlog.extend(self._scans.ready(self._steady_s(), is_over=True))
+        while self._backlog and self._steady_s() <= end_s:
+            self._map(self._backlog.popleft())
+        self.dropped += len(self._backlog)
         self._backlog.clear()
         self._commit()
 
@@ -107,23 +119,60 @@ class LiveMapping:
             return
         try:
             scan = self._decoder.decode(found, ready.messages.__getitem__, ready.pose_at)
-            if self._group.ends_before(scan.time_s, scan.T_map_rig):
-                self._commit()
-            self.commits += self._robot.observe(scan) is not None
         except (BadInputError, DamagedDataError) as exc:
-            log.warning("a scan of %s at %.3f s is left out: %s", found.camera, found.time_s, exc.message)
-            self._scans.left_out[Cause.DAMAGED] += 1
+            self._leave_out(ready, exc)
             return
+        if self._group.ends_before(scan.time_s, scan.T_map_rig):
+            self._commit()
+        self._observe(ready, scan)
+
+    def _observe(self, ready: ReadyScan, scan: Scan) -> None:
+        """Add a scan to the open measurement, which another epoch ends before."""
+        try:
+            is_committed = self._robot.observe(scan) is not None
+        except UnreachableError as exc:
+            self._keep_open(exc)
+            self.dropped += 1
+            return
+        except BadInputError as exc:
+            if exc.kind == TOO_LARGE:  # the measurement before, not this scan
+                self._give_up(exc)
+                self.dropped += 1
+            else:
+                self._leave_out(ready, exc)
+            return
+        if is_committed:
+            self.commits, self.refusal, self._open_scans = self.commits + 1, "", 0
         self.taken += 1
-        self.newest_s = max(self.newest_s, scan.time_s)
+        self.newest_s = scan.time_s
+        self._open_scans += 1
         self._last_scan_s = self._steady_s()
 
     def _commit(self) -> None:
         """Commit the open measurement; where the disk or the outbox is full it stays open, and is tried again."""
         try:
             self.commits += self._robot.commit(profile=self._profile) is not None
-            self.refusal, self._last_scan_s = "", None
+            self.refusal, self._open_scans, self._last_scan_s = "", 0, None
         except UnreachableError as exc:
-            if not self.refusal:
-                log.error("%s; mapping goes on in the open measurement", exc.message)
-            self.refusal, self._last_scan_s = exc.message, self._steady_s()
+            self._keep_open(exc)
+        except BadInputError as exc:
+            self._give_up(exc)
+
+    def _leave_out(self, ready: ReadyScan, exc: CairnError) -> None:
+        found = ready.found
+        log.warning("a scan of %s at %.3f s is left out: %s", found.camera, found.time_s, exc.message)
+        self._scans.left_out[Cause.DAMAGED] += 1
+
+    def _keep_open(self, exc: UnreachableError) -> None:
+        """Keep the open measurement, for which there is no room now."""
+        if not self.refusal:
+            log.error("%s; mapping goes on in the open measurement", exc.message)
+        self.refusal, self._last_scan_s = exc.message, self._steady_s()
+
+    def _give_up(self, exc: BadInputError) -> None:
+        """Drop the open measurement, which can be no commit: it would only grow."""
+        log.error("%s; its %d scans are dropped", exc.message, self._open_scans)
+        self._robot.discard()
+        self.taken -= self._open_scans
+        self.dropped += self._open_scans
+        self.refusal, self._open_scans, self._last_scan_s = "", 0, None

@@ -7,12 +7,14 @@ meanwhile are the first ones to be mapped.
 """
 
 import time
+from collections import Counter
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 
 from cairn_calib.rig.rig import Rig
 from cairn_client.live.foxglove_source import FoxgloveSource
+from cairn_client.live.inbox import Inbox
 from cairn_fusion.ros.bag import BagMessage, Topic
 from cairn_fusion.ros.bag_index import BagIndex, TopicIndex, add_message, wire_of
 from cairn_fusion.ros.bag_recording import Survey, image_topics, images_of, rig_of
@@ -28,7 +30,7 @@ OPEN_S = 8.0
 """Longest wait for all that a rig is built from, the connection included."""
 LOOK_S = 0.1
 EARLY_BYTES_MAX = 256_000_000
-"""Bytes of messages that are kept until the rig is known; beyond them the oldest go."""
+"""Bytes of messages that are kept until the rig is known; beyond them the oldest images go."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +42,8 @@ class OpenedLive:
     topics: dict[str, Topic]
     early: list[BagMessage]
     """Messages that came while it was opened."""
+    dropped: Counter[str]
+    """Messages that went for room meanwhile, by topic."""
 
 
 def open_live(
@@ -47,6 +51,7 @@ def open_live(
     mapping: BagMapping,
     *,
     within_s: float = OPEN_S,
+    early_bytes_max: int = EARLY_BYTES_MAX,
     steady_s: Callable[[], float] = time.monotonic,
 ) -> OpenedLive:
     """Open a source, and build the rig of a mapping from what it says.
@@ -56,24 +61,30 @@ def open_live(
     """
     end_s = steady_s() + within_s
     named = {**dict.fromkeys(mapping.topics()), mapping.poses.topic: None}
-    source.open(lambda topic: topic.name in named or topic.type in TRANSFORMS)
+
+    def is_wanted(topic: Topic) -> bool:
+        """True of the mapping's topics and of all transforms that can be read."""
+        return topic.name in named or (topic.type in TRANSFORMS and topic.wire is not None)
+
+    source.open(is_wanted)
     # Stage 1: the topics of the mapping, and their types.
     while not named.keys() <= source.topics.keys() and steady_s() < end_s - within_s / 2:
         time.sleep(LOOK_S)
-    topics = {name: topic for name, topic in source.topics.items() if name in named or topic.type in TRANSFORMS}
+    topics = {name: topic for name, topic in source.topics.items() if is_wanted(topic)}
     _check_topics(source.url, mapping, topics, offered=source.topics.keys())
     # Stage 2: the rig, from the first message of each topic and all transforms so far.
     index = BagIndex({name: TopicIndex(topic) for name, topic in topics.items()}, FrameTree(source.url), {})
-    early: list[BagMessage] = []
+    early = Inbox(bytes_max=early_bytes_max)
     while True:
         for message in source.take(within_s=LOOK_S):
-            # A node that started meanwhile may offer transforms, too.
+            # A node that started meanwhile may offer transforms, too; one that is gone again counts no more.
             if message.topic not in topics:
-                topics[message.topic] = source.topics.get(message.topic, Topic(message.topic, "", None, 0))
-                index.topics[message.topic] = TopicIndex(topics[message.topic])
-            early.append(message)
+                topic = source.topics.get(message.topic)
+                if topic is None or not is_wanted(topic):
+                    continue
+                topics[topic.name], index.topics[topic.name] = topic, TopicIndex(topic)
+            early.put(message)
             _add(index, message, source.url)
-        _keep_bounds(early)
         try:
             rig = _rig_of(index, mapping)
             break
@@ -82,10 +93,16 @@ def open_live(
                 raise _still_missing(exc, index, source, within_s) from exc
     scans = LiveScans(mapping.name, mapping, topics)
     _hold_cameras(scans.frames, index.tree, mapping, index)
-    return OpenedLive(rig, scans, topics, early)
+    return OpenedLive(rig, scans, topics, early.take(within_s=0.0), early.dropped)
 
 
-def survey_live(source: FoxgloveSource, *, seconds: float, on_message: Callable[[], object]) -> Survey:
+def survey_live(
+    source: FoxgloveSource,
+    *,
+    seconds: float,
+    on_message: Callable[[], object],
+    steady_s: Callable[[], float] = time.monotonic,
+) -> Survey:
     """Listen to all topics of a source for some seconds, and propose a mapping.
 
     Raises:
@@ -93,8 +110,8 @@ def survey_live(source: FoxgloveSource, *, seconds: float, on_message: Callable[
     """
     source.open(lambda topic: topic.wire is not None)
     index = BagIndex({}, FrameTree(source.url), {})
-    end_s = time.monotonic() + seconds
-    while time.monotonic() < end_s:
+    end_s = steady_s() + seconds
+    while steady_s() < end_s:
         for message in source.take(within_s=LOOK_S):
             if message.topic not in index.topics:
                 topic = source.topics.get(message.topic)
@@ -116,14 +133,6 @@ def _add(index: BagIndex, message: BagMessage, url: str) -> None:
         add_message(index, message, url)
     except (BadInputError, DamagedDataError):
         return
-
-
-def _keep_bounds(early: list[BagMessage]) -> None:
-    size_bytes, count = sum(len(message.data) for message in early), 0
-    while size_bytes > EARLY_BYTES_MAX:
-        size_bytes -= len(early[count].data)
-        count += 1
-    del early[:count]
 
 
 def _check_topics(url: str, mapping: BagMapping, topics: dict[str, Topic], *, offered: Collection[str]) -> None:
@@ -163,7 +172,7 @@ def _still_missing(exc: BadInputError, index: BagIndex, source: FoxgloveSource, 
         return BadInputError(
             "no_messages",
             f"a publisher is there, nothing came in {within_s:g} s: {', '.join(silent)}. Look on the robot with `ros2 "
-            f"topic hz {silent[0]}`: its driver may stand still, or its QoS fit no one",
+            f"topic hz {silent[0]}`: its driver may stand still, or no subscriber matches its QoS",
         )
     return BadInputError(exc.kind, f"{exc.message} (after {within_s:g} s at {source.url})")
 

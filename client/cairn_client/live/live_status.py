@@ -53,7 +53,7 @@ class LiveStatus(BaseModel):
     not_moved: int
     """Scans of a robot that had not moved."""
     dropped: int
-    """Scans that gave way to newer ones, because mapping was slower."""
+    """Scans that gave way to newer ones, because mapping was slower, or for which there was no room."""
     left_out: dict[str, int]
     """Range images that became no scan, by cause."""
     waiting: int
@@ -65,7 +65,7 @@ class LiveStatus(BaseModel):
     arrived_hz: float
     taken_hz: float
     newest_s: float | None
-    """Age of the newest scan taken by its stamp, seconds; None: there is none."""
+    """Age of the scan taken last by its stamp, seconds; None: there is none."""
     clock_apart_s: float | None
     """Median lead of this machine's clock over the stamps of images, seconds; None: unknown."""
     commits: int
@@ -102,6 +102,8 @@ class StatusWatch:
     topics: dict[str, Topic]
     start_s: float
     """Steady time of the start."""
+    early_dropped: Counter[str] = field(default_factory=Counter)
+    """Messages that went for room while the source was opened, by topic."""
     _before: deque[_Counts] = field(default_factory=deque)
     _last: dict[str, tuple[int, float]] = field(default_factory=dict)
     """Count of each topic's messages, and the steady time at which that count was first seen."""
@@ -115,9 +117,9 @@ class StatusWatch:
         self._before.append(_Counts(self.start_s, 0, 0, {}, Counter()))
 
     def note_lead(self, wall_s: float) -> None:
-        """Note how far this machine's time of day is ahead of the newest image's stamp, if a newer one came."""
-        if self.scans.newest_s > self._noted_s:
-            self._noted_s = self.scans.newest_s
+        """Note how far this machine's time of day is ahead of the last range image's stamp, if another one came."""
+        if self.scans.last_s != self._noted_s:
+            self._noted_s = self.scans.last_s
             self._leads_s.append(wall_s - self._noted_s)
 
     def status(self, now_s: float, wall_s: float, *, commits_waiting: int) -> LiveStatus:
@@ -131,7 +133,7 @@ class StatusWatch:
         base = self._before[0]
         span_s = max(now_s - base.steady_s, 1e-9)
         self._shown = {name: (count - base.left.get(name, 0)) / span_s for name, count in left.items()}
-        offered, dropped = self.source.topics, self.source.dropped
+        offered, dropped = self.source.topics, self.source.dropped + self.early_dropped
         lead_s = statistics.median(self._leads_s) if self._leads_s else None
         rates_hz = {name: (counts[name] - base.topics[name]) / span_s for name in sorted(self.topics)}
         topics = [
@@ -198,7 +200,7 @@ class StatusWatch:
                 said.append(f"{status.topic}: no publisher")
             elif not is_latched and status.silent_s > SILENT_S:
                 said.append(f"{status.topic}: publisher there, nothing came for {status.silent_s:.0f} s")
-        if lead_s is not None and self.scans.newest_s < SIMULATED_S:
+        if lead_s is not None and self.scans.last_s < SIMULATED_S:
             said.append("stamps are of a simulation's clock (use_sim_time)")
         elif lead_s is not None and abs(lead_s) > CLOCK_S:
             said.append(f"clock apart {lead_s:.0f} s: this machine's and the robot's differ")

@@ -26,6 +26,8 @@ CHUNK_BYTES_MAX = 256 << 20
 """Largest unpacked chunk, and so the largest message; bags are recorded in chunks of about 1 MB."""
 UNPACKED_PER_BYTE_MAX = 1000
 UNPACKED_BYTES_MIN = 512 << 20
+HELD_BYTES = 200
+"""Memory that a message takes next to its data: objects of Python for itself, its bytes and its stamp."""
 MESSAGES_MAX = 20_000_000
 """Largest number of messages; their times take 320 MB."""
 FOREIGN_ERRORS: tuple[type[Exception], ...] = (

@@ -21,6 +21,9 @@ WINDOW_S = 60.0
 EDGES_MAX = 1000
 EDGE_POSES_MAX = 20_000
 """Poses of one edge within the window: some 300 Hz."""
+POSES_MAX = 400_000
+"""Poses of all edges: those of 60 joints at 100 Hz, some 200 MB. Beyond it every edge keeps its newest ones, half as
+many in all."""
 
 
 @dataclass(slots=True)
@@ -42,8 +45,16 @@ class LiveEdge:
         self.times_s.insert(at, found.time_s)
         self.poses.insert(at, found)
         old = max(bisect_left(self.times_s, self.times_s[-1] - window_s), len(self.times_s) - EDGE_POSES_MAX)
-        if old > 0:
-            del self.times_s[:old], self.poses[:old]
+        self._forget(old)
+
+    def keep_newest(self, count: int) -> None:
+        """Forget all poses but so many."""
+        self._forget(len(self.times_s) - count)
+
+    def _forget(self, count: int) -> None:
+        """Forget the oldest poses."""
+        if count > 0:
+            del self.times_s[:count], self.poses[:count]
 
     def between(self, first_s: float, last_s: float) -> list[RosTransform]:
         """Poses of a span of time, with the one before it and the one after it."""
@@ -54,12 +65,15 @@ class LiveEdge:
 class LiveFrames:
     """Edges of a live robot, by the child's name."""
 
-    def __init__(self, source: str, *, window_s: float = WINDOW_S) -> None:
+    def __init__(self, source: str, *, window_s: float = WINDOW_S, poses_max: int = POSES_MAX) -> None:
         """Args: source: name of the robot in errors."""
         self.source = source
         self.rounding = PoseRounding()
         self.edges: dict[str, LiveEdge] = {}
+        self.poses = 0
+        """Poses of all edges."""
         self._window_s = window_s
+        self._poses_max = poses_max
         self._held: dict[str, array[float]] = {}
 
     def add(self, found: RosTransform, *, is_static: bool) -> None:
@@ -91,10 +105,17 @@ class LiveFrames:
                 f"{self.source}: frame {found.child} hangs on {edge.parent} and, at {found.time_s:.3f} s, on "
                 f"{found.parent}; only one of them may be published",
             )
+        before = len(edge.poses)
         if is_static:
             edge.is_static, edge.times_s, edge.poses = True, [found.time_s], [found]
         elif not edge.is_static:
             edge.add(found, self._window_s)
+        self.poses += len(edge.poses) - before
+        if self.poses > self._poses_max:
+            share = max(1, self._poses_max // 2 // len(self.edges))
+            for one in self.edges.values():
+                one.keep_newest(share)
+            self.poses = sum(len(one.poses) for one in self.edges.values())
 
     def hold(self, children: Iterable[str], tree: FrameTree) -> None:
         """Refuse other poses of these edges than a tree has, from here on."""

@@ -18,7 +18,7 @@ import numpy as np
 
 from cairn_calib.rig.rig import Spectrum
 from cairn_fusion.recording.timed_lists import TimedList
-from cairn_fusion.ros.bag import BagMessage, Topic
+from cairn_fusion.ros.bag import HELD_BYTES, BagMessage, Topic
 from cairn_fusion.ros.bag_index import BASE, STATIC_NAME, BagIndex, TopicIndex, translate_message_damage, wire_of
 from cairn_fusion.ros.bag_scans import BagScan, PoseAt, images_near, poses_of
 from cairn_fusion.ros.live_frames import WINDOW_S, LiveFrames
@@ -33,7 +33,7 @@ SWEEP_S = 0.25
 SEEN_MAX = 4096
 """Stamps of one camera that are remembered, so that no image becomes a scan twice."""
 IMAGE_BYTES_MAX = 256_000_000
-"""Most bytes of images that wait for a decision; beyond it the oldest go."""
+"""Most bytes of images that wait for a decision; beyond it the oldest go, of the topic that holds most."""
 OTHERS_S = 2.0
 """Age at which an image that no range image needed is forgotten, behind the newest of its topic."""
 
@@ -49,6 +49,8 @@ class Cause(StrEnum):
     """The poses before and after it are too far apart."""
     DAMAGED = "damaged"
     AGAIN = "sent twice"
+    CLOCK_BACK = "clock set back"
+    """The clock of its camera was set back by a minute or more while it waited."""
     NO_ROOM = "no room"
     """Dropped, oldest first, for the bytes of images that may wait."""
 
@@ -70,31 +72,48 @@ class _Images:
 
     times_s: list[float] = field(default_factory=list)
     messages: list[BagMessage] = field(default_factory=list)
+    size_bytes: int = 0
+    """Memory of all images."""
+
+    def is_set_back(self, time_s: float) -> bool:
+        """True if a stamp is of a clock that was set back since the newest image."""
+        return bool(self.times_s) and time_s < self.times_s[-1] - WINDOW_S
 
     def add(self, time_s: float, message: BagMessage) -> bool:
-        """Add an image; False if there is one of that stamp. Those of a clock that was set back begin again."""
-        if self.times_s and time_s < self.times_s[-1] - WINDOW_S:
-            self.times_s, self.messages = [], []
+        """Add an image; False if there is one of that stamp."""
         at = bisect_left(self.times_s, time_s)
         if at < len(self.times_s) and self.times_s[at] == time_s:
             return False
         self.times_s.insert(at, time_s)
         self.messages.insert(at, message)
+        self.size_bytes += _held_bytes(message)
         return True
+
+    def forget(self, time_s: float) -> None:
+        """Drop the image of a stamp, if it is there."""
+        at = bisect_left(self.times_s, time_s)
+        if at < len(self.times_s) and self.times_s[at] == time_s:
+            self._drop(slice(at, at + 1))
 
     def forget_before(self, time_s: float) -> None:
         """Drop the images before a time."""
-        old = bisect_left(self.times_s, time_s)
-        del self.times_s[:old], self.messages[:old]
+        self._drop(slice(0, bisect_left(self.times_s, time_s)))
+
+    def clear(self) -> None:
+        """Drop all images."""
+        self._drop(slice(0, None))
 
     def timed(self) -> TimedList[int]:
         """Numbers of the images by time."""
         return TimedList(np.array(self.times_s, np.float64), tuple(range(len(self.times_s))))
 
-    @property
-    def size_bytes(self) -> int:
-        """Bytes of all images."""
-        return sum(len(message.data) for message in self.messages)
+    def _drop(self, which: slice) -> None:
+        self.size_bytes -= sum(map(_held_bytes, self.messages[which]))
+        del self.times_s[which], self.messages[which]
+
+
+def _held_bytes(message: BagMessage) -> int:
+    return len(message.data) + HELD_BYTES
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,8 +149,8 @@ class LiveScans:
         """Messages of any topic that could not be read."""
         self.frame_error = ""
         """Newest reason for which a transform was not taken, or no way leads to the map; empty: there is none."""
-        self.newest_s = -np.inf
-        """Newest stamp of a range image."""
+        self.last_s = -np.inf
+        """Stamp of the range image that came last; a newest one would stay at one wrong stamp of the future."""
         self._source = source
         self._mapping = mapping
         self._topics = dict(topics)
@@ -148,6 +167,11 @@ class LiveScans:
     def waiting(self) -> int:
         """Range images that wait for their pose, or for other images."""
         return len(self._pending)
+
+    @property
+    def held_bytes(self) -> int:
+        """Memory of the images that wait, bytes."""
+        return sum(images.size_bytes for images in self._images.values())
 
     def add(self, message: BagMessage, now_s: float) -> None:
         """Add a message of one of the topics; one that cannot be read is counted.
@@ -199,26 +223,40 @@ class LiveScans:
         camera = self._ranges.get(topic.name)
         if camera is not None:
             self.arrived[camera] += 1
-            self.newest_s = max(self.newest_s, time_s)
+            self.last_s = time_s
             if time_s in self._seen[topic.name]:
                 self.left_out[Cause.AGAIN] += 1
                 return
             self._seen[topic.name].append(time_s)
-            self._pending.append(_Pending(camera, time_s, now_s))
         images = self._images[topic.name]
-        images.add(time_s, message)
+        if images.is_set_back(time_s):
+            # What waits is of the other time, and a scan is nothing without its own image.
+            for pending in [one for one in self._pending if one.camera == camera]:
+                self._leave_out(pending, Cause.CLOCK_BACK)
+            images.clear()
+        is_new = images.add(time_s, message)
+        if camera is not None and is_new:
+            self._pending.append(_Pending(camera, time_s, now_s))
+        elif camera is not None:  # more stamps ago than are remembered
+            self.left_out[Cause.AGAIN] += 1
         self._keep_bounds(images)
 
     def _keep_bounds(self, images: _Images) -> None:
-        """Forget images that no range image can need any more, and the oldest beyond the bytes that may wait."""
+        """Forget images that no range image can need, and beyond the bytes that may wait the oldest."""
         needed_s = min((pending.time_s for pending in self._pending), default=np.inf)
         images.forget_before(min(needed_s - self._mapping.time_tolerance_s, images.times_s[-1] - OTHERS_S))
-        while sum(one.size_bytes for one in self._images.values()) > self._image_bytes_max and len(self._pending) > 1:
-            oldest = min(self._pending, key=lambda pending: pending.arrived_s)
-            self._forget(oldest)
-            self.left_out[Cause.NO_ROOM] += 1
+        while self.held_bytes > self._image_bytes_max and len(self._pending) > 1:
+            self._leave_out(min(self._pending, key=lambda pending: pending.arrived_s), Cause.NO_ROOM)
             for one in self._images.values():
                 one.forget_before(min(pending.time_s for pending in self._pending) - self._mapping.time_tolerance_s)
+        # Images that no range image asks for, or of stamps that are close together, have no end of their own.
+        while self.held_bytes > self._image_bytes_max:
+            topic, largest = max(self._images.items(), key=lambda entry: entry[1].size_bytes)
+            oldest_s = largest.times_s[0]
+            camera = self._ranges.get(topic)
+            for pending in [one for one in self._pending if one.camera == camera and one.time_s == oldest_s]:
+                self._leave_out(pending, Cause.NO_ROOM)
+            largest.forget(oldest_s)
 
     def ready(self, now_s: float, *, is_over: bool = False) -> Iterator[ReadyScan]:
         """Scans that are complete, in order of time; those that waited too long are taken as they are, or left out.
@@ -291,16 +329,12 @@ class LiveScans:
         numbers = images_near(self._mapping, camera, lists, pending.time_s)
         self.alone += len(numbers) < len(lists)
         messages = {topic: self._images[topic].messages[n] for topic, n in numbers.items()}
-        self._forget_image(camera.topic, pending.time_s)
+        self._images[camera.topic].forget(pending.time_s)
         found = BagScan(time_s=pending.time_s, T_map_rig=pose_at(pending.time_s), camera=pending.camera, images=numbers)
         return ReadyScan(found, messages, lambda time_s: pose_at(min(max(time_s, first_s), last_s)), pending.arrived_s)
 
-    def _forget(self, pending: _Pending) -> None:
+    def _leave_out(self, pending: _Pending, cause: Cause) -> None:
+        """Drop a range image that waits, and count it."""
         self._pending.remove(pending)
-        self._forget_image(self._mapping.cameras[pending.camera].topic, pending.time_s)
-
-    def _forget_image(self, topic: str, time_s: float) -> None:
-        images = self._images[topic]
-        at = bisect_left(images.times_s, time_s)
-        if at < len(images.times_s) and images.times_s[at] == time_s:
-            del images.times_s[at], images.messages[at]
+        self._images[self._mapping.cameras[pending.camera].topic].forget(pending.time_s)
+        self.left_out[cause] += 1

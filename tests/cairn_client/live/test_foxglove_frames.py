@@ -86,6 +86,7 @@ def test_what_is_sent_is_what_the_protocol_asks_for() -> None:
         '{"op": "advertise", "channels": [{"id": 1, "topic": ["/a"], "encoding": "cdr"}]}',
         '{"op": "advertise", "channels": [{"id": 1, "topic": "/' + "a" * 2000 + '", "encoding": "cdr"}]}',
         '{"op": "unadvertise", "channelIds": "all"}',
+        '{"op": "serverInfo", "name": "' + "a" * (4 << 20) + '"}',
         b"\x01",
         b"\x01\0\0\0\0\0\0\0\0\0\0\0",
     ],

@@ -44,6 +44,14 @@ def test_small_messages_alone_are_bounded_too_and_the_newest_stays() -> None:
     assert len(inbox.take(within_s=0.0)) == 1
 
 
+def test_messages_without_bytes_are_bounded_by_what_they_take_themselves() -> None:
+    inbox = Inbox(bytes_max=100_000)
+    for n in range(10_000):
+        inbox.put(BagMessage("/tf", n, b""))
+    taken = inbox.take(within_s=0.0)
+    assert 0 < len(taken) <= 500 and len(taken) + inbox.dropped["/tf"] == 10_000
+
+
 def test_a_reader_that_waits_wakes_with_the_message_or_the_end() -> None:
     inbox, found = Inbox(), []
     reader = threading.Thread(target=lambda: found.extend([inbox.take(within_s=30.0), inbox.take(within_s=30.0)]))

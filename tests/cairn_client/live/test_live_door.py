@@ -5,14 +5,16 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import count
 from pathlib import Path
 
 import pytest
 from tests.fixtures.client.bridge import Bridge, a_bridge
-from tests.fixtures.client.live_server import LiveServer, wait_until
+from tests.fixtures.client.live_server import WAIT_S, LiveServer, wait_until
 from tests.fixtures.fusion.bags import ROS2, Messages, Timed, write_bag
 from tests.fixtures.fusion.drive_mapping import mapping_text
 from tests.fixtures.fusion.live_drive import drive, in_bag_order, latched
@@ -21,11 +23,12 @@ from websockets.sync.server import ServerConnection, serve
 from cairn_client import main as cairn
 from cairn_client.live.foxglove_source import FoxgloveSource
 from cairn_client.live.live_mapping import LiveMapping
-from cairn_client.live.live_opening import open_live
+from cairn_client.live.live_opening import EARLY_BYTES_MAX, OpenedLive, open_live, survey_live
 from cairn_client.robot.robot import Robot
 from cairn_fusion.mapping.scan_gate import GateBounds, ScanGate
+from cairn_fusion.ros.bag_recording import Survey
 from cairn_fusion.ros.scan_decoder import ScanDecoder
-from cairn_fusion.ros.topic_mapping import mapping_from_yaml
+from cairn_fusion.ros.topic_mapping import BagMapping, mapping_from_yaml
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.channels import COLOUR, TEMPERATURE
 from cairn_map.evidence.grid import geometry_for
@@ -47,12 +50,20 @@ def bridge() -> Iterator[Bridge]:
 class LiveRun:
     """A live robot in this thread, which takes what the bridge has sent."""
 
-    def __init__(self, bridge: Bridge, folder: Path, timed: Sequence[Timed], gate: ScanGate) -> None:
+    def __init__(
+        self,
+        bridge: Bridge,
+        folder: Path,
+        timed: Sequence[Timed],
+        gate: ScanGate,
+        *,
+        early_bytes_max: int = EARLY_BYTES_MAX,
+    ) -> None:
         self.bridge = bridge
         self.source = FoxgloveSource(bridge.url)
         opening = threading.Thread(target=self._begin, args=(timed,))
         opening.start()
-        opened = open_live(self.source, MAPPING)
+        self.opened = opened = open_live(self.source, MAPPING, early_bytes_max=early_bytes_max)
         opening.join()
         self.scans = opened.scans
         self.robot = Robot(opened.rig, NOWHERE, directory=folder, name="live", geometry=GRID, stay=True)
@@ -146,6 +157,45 @@ def test_a_bridge_that_starts_again_is_found_again_and_no_scan_comes_twice(bridg
     assert run.finish() == replay_digest(tmp_path, timed, "--every-scan")
 
 
+def test_transforms_that_are_not_coded_as_ros_does_are_not_subscribed(bridge: Bridge, tmp_path: Path) -> None:
+    timed = drive(MAKE, scans=3)
+    bridge.offer("/foreign", "tf2_msgs/msg/TFMessage", encoding="json")
+    bridge.offer_all(timed)
+    run = LiveRun(bridge, tmp_path / "live", timed, ScanGate(None))
+    assert "/foreign" in run.source.topics and "/foreign" not in run.opened.topics
+    assert not bridge.subscribed["/foreign"]
+    run.finish()
+
+
+def test_what_goes_for_room_while_it_opens_is_counted(bridge: Bridge, tmp_path: Path) -> None:
+    timed = drive(MAKE, scans=3)
+    bridge.offer_all(timed)
+    run = LiveRun(bridge, tmp_path / "live", timed, ScanGate(None), early_bytes_max=1)
+    assert len(run.opened.early) == 1  # the newest
+    assert run.opened.dropped.total() >= 5  # of the six that a rig is built from
+    run.finish()
+
+
+def test_the_channels_of_a_bridge_have_one_bound_over_all_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cairn_client.live.foxglove_source.CHANNELS_MAX", 3)
+
+    def handle(link: ServerConnection) -> None:
+        for first in (0, 2):
+            channels = [{"id": first + n, "topic": f"/{first + n}", "encoding": "cdr"} for n in range(2)]
+            link.send(json.dumps({"op": "advertise", "channels": channels}))
+        for _ in link:
+            pass
+
+    with scripted(handle, subprotocols=["foxglove.sdk.v1"]) as url:
+        source = FoxgloveSource(url)
+        source.open(lambda topic: False)
+        try:
+            wait_until(lambda: source.damaged == 1)
+            assert source.topics.keys() == {"/0", "/1"}
+        finally:
+            source.close()
+
+
 def test_a_topic_that_is_offered_again_under_another_id_goes_on(bridge: Bridge) -> None:
     timed = drive(MAKE, scans=3)
     bridge.offer_all(timed)
@@ -232,7 +282,13 @@ def test_no_bridge_and_what_is_none_are_told_apart(tmp_path: Path, capsys: pytes
     assert "no Foxglove bridge answers at ws://127.0.0.1:9" in said and "ros2 launch foxglove_bridge" in said
     with scripted(lambda link: None) as url:  # as rosbridge: no subprotocol
         assert "speaks none of foxglove.sdk.v1" in refused(capsys, tmp_path, url)
-    assert "ws://HOST:PORT" in refused(capsys, tmp_path, "zenoh://127.0.0.1:7447")
+
+
+@pytest.mark.parametrize("url", ["zenoh://127.0.0.1:1", "ws://h:99999", "ws://h:abc", "ws://[::1", "ws://a..b:1"])
+def test_what_is_no_url_of_a_bridge_is_refused(url: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "ws://HOST:PORT" in refused(capsys, tmp_path, url)
+    assert cairn.main(["robot", "inspect", url]) == 2
+    assert "[bad_url]" in (said := capsys.readouterr().err.strip()) and "\n" not in said
 
 
 def test_a_server_of_http_is_no_bridge(server: LiveServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -242,11 +298,22 @@ def test_a_server_of_http_is_no_bridge(server: LiveServer, tmp_path: Path, capsy
 def test_topics_that_are_missing_silent_or_of_another_type_are_named(
     bridge: Bridge, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("cairn_client.cli.robots.live_run.open_live", lambda s, m: open_live(s, m, within_s=2.0))
     timed = drive(MAKE, scans=3)
-    bridge.offer_all(entry for entry in timed if entry[1] != "/warm/image")
+    offered: set[str] = {topic for topic in TOPICS if topic != "/warm/image"}
+
+    def open_patiently(source: FoxgloveSource, mapping: BagMapping) -> OpenedLive:
+        """Open by a clock that stands still until the bridge has said what it offers."""
+        clock = clock_after(lambda: offered <= source.topics.keys())
+        return open_live(source, mapping, within_s=2.0, steady_s=clock)
+
+    monkeypatch.setattr("cairn_client.cli.robots.live_run.open_live", open_patiently)
+    bridge.offer_all(entry for entry in timed if entry[1] in offered)
+    bridge.offer(steering := "/a\x1b[2J\nb", "std_msgs/msg/String")
+    offered.add(steering)
     said = refused(capsys, tmp_path, bridge.url)
-    assert "offers no topic /warm/image (images of camera warm); it offers /colour/image" in said
+    assert "offers no topic /warm/image (images of camera warm); it offers " in said and "/colour/image" in said
+    assert "\x1b" not in said
+    offered.add("/warm/image")
     bridge.offer("/warm/image", "std_msgs/msg/String")
     assert "/warm/image of ws:" in (said := refused(capsys, tmp_path, bridge.url))
     assert "holds std_msgs/String; sensor_msgs/Image or" in said
@@ -255,6 +322,12 @@ def test_topics_that_are_missing_silent_or_of_another_type_are_named(
     bridge.offer("/warm/image", "sensor_msgs/msg/Image")
     said = refused(capsys, tmp_path, bridge.url)
     assert "a publisher is there, nothing came in 2 s" in said and "/depth/image" in said
+
+
+def clock_after(is_true: Callable[[], bool]) -> Callable[[], float]:
+    """A clock that ticks 0.1 s at each look once something is true, or was waited for in vain."""
+    ticks, end_s = count(1), time.monotonic() + WAIT_S
+    return lambda: next(ticks) / 10 if is_true() or time.monotonic() > end_s else 0.0
 
 
 def test_a_topics_file_with_a_question_is_refused(
@@ -306,23 +379,26 @@ def test_the_command_maps_until_a_signal_and_says_what_came(bridge: Bridge, tmp_
         "--json",
     ]
     with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as running:
-        assert running.stdout is not None
-        first = next(n for n, entry in enumerate(timed) if entry[1] == "/depth/image") + 6
-        bridge.wait_for(*TOPICS)
-        bridge.latch(latched(MAKE))
-        for entry in timed[:first]:
-            bridge.send(entry)
-        for topic in TOPICS[3:]:
-            bridge.send(next(entry for entry in timed if entry[1] == topic))
-        # The first scan loads the kernels, for which the others would wait too long.
-        statuses = (json.loads(line) for line in running.stdout)
-        assert next(status for status in statuses if status["taken"])["missing"] is not None
-        for entry in timed[first:]:
-            bridge.send(entry)
-        last = next(status for status in statuses if status["arrived"] == 20 and not status["waiting"])
-        running.send_signal(signal.SIGINT)
-        out, err = running.communicate(timeout=60)
-    assert running.returncode == 0, err
+        try:
+            assert running.stdout is not None
+            first = next(n for n, entry in enumerate(timed) if entry[1] == "/depth/image") + 6
+            bridge.wait_for(*TOPICS)
+            bridge.latch(latched(MAKE))
+            for entry in timed[:first]:
+                bridge.send(entry)
+            for topic in TOPICS[3:]:
+                bridge.send(next(entry for entry in timed if entry[1] == topic))
+            # The first scan loads the kernels, for which the others would wait too long.
+            statuses = (json.loads(line) for line in running.stdout)
+            assert next(status for status in statuses if status["taken"])["missing"] is not None
+            for entry in timed[first:]:
+                bridge.send(entry)
+            last = next(status for status in statuses if status["arrived"] == 20 and not status["waiting"])
+            running.send_signal(signal.SIGINT)
+            out, err = running.communicate(timeout=60)
+            assert running.returncode == 0, err
+        finally:
+            running.kill()  # a failed assertion would wait for it
     assert last["taken"] + sum(last["left_out"].values()) + last["dropped"] == 20
     assert {topic["topic"] for topic in last["topics"]} == set(TOPICS) and last["links"] == 1
     assert any("clock apart" in text for text in last["missing"])  # the stamps are of 2023
@@ -331,9 +407,16 @@ def test_the_command_maps_until_a_signal_and_says_what_came(bridge: Bridge, tmp_
 
 @pytest.mark.slow
 def test_inspect_proposes_from_a_live_source_what_live_takes(
-    bridge: Bridge, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    bridge: Bridge, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     timed = [entry for entry in drive(MAKE, scans=20) if not entry[1].startswith("/warm")]
+
+    def survey_all(source: FoxgloveSource, *, seconds: float, on_message: Callable[[], object]) -> Survey:
+        """Listen by a clock that stands still until all has come."""
+        clock = clock_after(lambda: source.counts.total() >= len(timed))
+        return survey_live(source, seconds=seconds, on_message=on_message, steady_s=clock)
+
+    monkeypatch.setattr("cairn_client.live.live_opening.survey_live", survey_all)
     bridge.offer_all(timed)
     sender = threading.Thread(target=send_when, args=(bridge, timed))
     sender.start()

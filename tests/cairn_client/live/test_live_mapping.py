@@ -1,5 +1,6 @@
 """Live mapping without a door: newest wins on a slow machine, every image is accounted for, and rest is committed."""
 
+import time
 from collections.abc import Iterator
 from itertools import groupby
 from pathlib import Path
@@ -11,15 +12,19 @@ from tests.fixtures.fusion.live_drive import bag_message, drive, in_bag_order
 
 from cairn_calib.rig.rig import Rig
 from cairn_client.live.live_mapping import BEHIND_S, REST_S, LiveMapping
+from cairn_client.replica.limits import Limits
 from cairn_client.robot.robot import Robot
+from cairn_client.sync.responses import TimeSample
 from cairn_fusion.mapping.scan_gate import ScanGate
 from cairn_fusion.ros.bag import BagMessage
 from cairn_fusion.ros.bag_recording import open_bag_recording
 from cairn_fusion.ros.live_scans import Cause, LiveScans
 from cairn_fusion.ros.scan_decoder import ScanDecoder
 from cairn_fusion.ros.topic_mapping import mapping_from_yaml
+from cairn_map.epochs.layer import MapLayer
+from cairn_map.errors import UnreachableError
 from cairn_map.evidence.channels import COLOUR, TEMPERATURE
-from cairn_map.evidence.grid import geometry_for
+from cairn_map.evidence.grid import Geometry, geometry_for
 
 NOWHERE = "http://127.0.0.1:9/maps/lab"
 GRID = geometry_for(voxel_edge_m=0.05, channels=(COLOUR, TEMPERATURE))
@@ -38,18 +43,23 @@ class Clock:
 
     def __init__(self) -> None:
         self.now_s = 0.0
+        self.tick_s = 0.0
+        """Time that each look takes."""
 
     def __call__(self) -> float:
+        self.now_s += self.tick_s
         return self.now_s
 
 
 class Driven:
     """A live robot whose messages and time a test gives."""
 
-    def __init__(self, rig: Rig, folder: Path, gate: ScanGate) -> None:
+    def __init__(
+        self, rig: Rig, folder: Path, gate: ScanGate, *, layer: MapLayer | Geometry = GRID, limits: Limits | None = None
+    ) -> None:
         self.clock = Clock()
         self.scans = LiveScans("drive", MAPPING, TOPICS)
-        self.robot = Robot(rig, NOWHERE, directory=folder, name="mole", geometry=GRID, stay=True)
+        self.robot = Robot(rig, NOWHERE, directory=folder, name="mole", geometry=layer, limits=limits, stay=True)
         decoder = ScanDecoder("drive", MAPPING, rig, TOPICS)
         self.live = LiveMapping(self.robot, self.scans, decoder, gate, steady_s=self.clock)
 
@@ -84,7 +94,7 @@ def test_a_robot_slower_than_its_cameras_maps_the_newest_and_counts_the_rest(dri
         driven.clock.now_s += 1 / 3
         driven.step(messages)
         if driven.live.taken:
-            ages_s.append(driven.scans.newest_s - driven.live.newest_s)
+            ages_s.append(driven.scans.last_s - driven.live.newest_s)
     assert max(ages_s) <= BEHIND_S + 1.0
     assert driven.live.waiting <= 20
     driven.live.finish()
@@ -116,3 +126,56 @@ def test_a_measurement_is_committed_when_nothing_more_comes(driven: Driven) -> N
     driven.clock.now_s += REST_S + 1.0
     driven.step([])
     assert driven.live.commits == 1
+
+
+def map_all(driven: Driven) -> None:
+    """Step through the drive until no scan waits for its turn."""
+    for entry in DRIVE:
+        driven.step([bag_message(entry)])
+    while driven.live.is_behind:
+        driven.step([])
+
+
+def learn_time(robot: Robot) -> None:
+    """Let a robot know a server's time, without which a commit has no epoch."""
+    robot._clock.learn(TimeSample(server_s=DRIVE[-1][0] + 1000, steady_s=time.monotonic(), error_s=0.0))
+
+
+def test_a_full_outbox_at_the_border_of_an_epoch_leaves_the_measurement_open(
+    rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cairn_client.replica.limits.LEAST_BYTES", 1)
+    layer, limits = MapLayer(geometry=GRID, epoch_s=2), Limits(outbox_bytes_max=1)
+    driven = Driven(rig, tmp_path / "mole", ScanGate(None), layer=layer, limits=limits)
+    learn_time(driven.robot)
+    map_all(driven)
+    assert 0 < driven.live.taken < 30 and driven.live.dropped > 50
+    assert "outbox_bytes_max" in driven.live.refusal and driven.live.commits == 0
+    driven.live.finish()
+    driven.check_account()
+    with pytest.raises(UnreachableError):
+        driven.robot.close()
+
+
+@pytest.mark.parametrize("epoch_s", [2, 86_400])
+def test_a_measurement_too_large_for_a_commit_is_dropped_and_no_scan_counts_as_damaged(
+    rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, epoch_s: int
+) -> None:
+    monkeypatch.setattr("cairn_map.commits.commit.COMMIT_BYTES_MAX", 100)
+    driven = Driven(rig, tmp_path / "mole", ScanGate(None), layer=MapLayer(geometry=GRID, epoch_s=epoch_s))
+    learn_time(driven.robot)
+    map_all(driven)
+    assert driven.live.dropped >= 10 and Cause.DAMAGED not in driven.scans.left_out
+    driven.live.finish()
+    driven.check_account()
+    assert driven.live.taken == driven.live.commits == 0
+    driven.robot.close()
+
+
+def test_what_waits_at_the_end_is_mapped_for_a_second_and_the_rest_is_dropped(driven: Driven) -> None:
+    for entry in DRIVE:
+        driven.scans.add(bag_message(entry), 0.0)
+    driven.clock.tick_s = 0.1
+    driven.live.finish()
+    driven.check_account()
+    assert 0 < driven.live.taken < 15 and driven.live.dropped > 50 and driven.live.waiting == 0

@@ -12,7 +12,9 @@ from cairn_calib.rig.rig import Rig
 from cairn_fusion.recording.scan_bytes import encode_scan
 from cairn_fusion.ros.bag import BagMessage
 from cairn_fusion.ros.bag_recording import BagRecording, open_bag_recording
+from cairn_fusion.ros.live_frames import LiveFrames
 from cairn_fusion.ros.live_scans import Cause, LiveScans, ReadyScan
+from cairn_fusion.ros.messages import RosTransform
 from cairn_fusion.ros.scan_decoder import ScanDecoder
 from cairn_fusion.ros.topic_mapping import mapping_from_yaml
 from cairn_map.errors import BadInputError
@@ -146,6 +148,24 @@ def test_a_clock_that_jumps_back_gives_no_wrong_pose(replay: BagRecording) -> No
     assert found[then_s][0, 3] == pytest.approx(-0.4 * back_s, abs=1e-3)
 
 
+def test_an_old_stamp_while_an_image_waits_leaves_that_one_out_and_counts_it() -> None:
+    scans = live()
+    for entry in (latched(MAKE), moving(MAKE, START_S), depth(MAKE, START_S, 1), depth(MAKE, START_S - 61, 2)):
+        scans.add(bag_message(entry), 0.0)
+    assert scans.left_out == {Cause.CLOCK_BACK: 1} and scans.waiting == 1
+    for entry in (moving(MAKE, START_S + 0.1), depth(MAKE, START_S + 0.05, 3)):
+        scans.add(bag_message(entry), 0.1)
+    (ready,) = scans.ready(2.0)
+    assert ready.found.time_s == START_S + 0.05 and "/depth/image" in ready.messages
+
+
+def test_one_stamp_of_the_future_is_not_the_last_one_for_ever() -> None:
+    scans = live()
+    for time_s in (START_S, START_S + 1000, START_S + 0.1):
+        scans.add(bag_message(depth(MAKE, time_s, 1)), 0.0)
+    assert scans.last_s == START_S + 0.1
+
+
 def test_a_camera_that_moves_on_the_base_ends_it() -> None:
     scans = live()
     scans.add(bag_message(latched(MAKE)), 0.0)
@@ -167,6 +187,29 @@ def test_images_that_wait_are_bounded_by_their_bytes() -> None:
         scans.add(bag_message(depth(MAKE, START_S + n / 10, n)), 0.0)
     assert scans.waiting <= 5
     assert scans.left_out[Cause.NO_ROOM] + scans.waiting == 50
+
+
+@pytest.mark.parametrize("topics", [["/colour/image"], ["/depth/image"], ["/colour/image", "/depth/image"]])
+def test_images_of_any_topic_and_stamp_stay_within_the_bytes(topics: Sequence[str]) -> None:
+    scans = live(image_bytes_max=2000)
+    for n in range(60):
+        # Stamps of one millisecond: none is too old.
+        image = bag_message(depth(MAKE, START_S + n / 60_000, n))._replace(topic=topics[n % len(topics)])
+        scans.add(image, 0.0)
+        assert scans.held_bytes <= 2000
+    assert scans.left_out.total() + scans.waiting == scans.arrived.total()
+    assert len(list(scans.ready(0.0, is_over=True))) == 0
+    assert scans.left_out.total() == scans.arrived.total()
+
+
+def test_poses_of_all_edges_have_one_bound_and_the_newest_stay() -> None:
+    frames = LiveFrames("drive", poses_max=100)
+    for n in range(60):
+        for child in range(5):
+            pose = RosTransform(START_S + n / 10, "base_link", f"joint_{child}", np.array([n, 0, 0, 0, 0, 0, 1.0]))
+            frames.add(pose, is_static=False)
+            assert frames.poses == sum(len(edge.poses) for edge in frames.edges.values()) <= 100
+    assert all(edge.poses[-1].pose[0] == 59 and len(edge.poses) > 5 for edge in frames.edges.values())
 
 
 def test_damaged_messages_are_counted_and_nothing_else() -> None:

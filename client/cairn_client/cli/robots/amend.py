@@ -8,7 +8,8 @@
 A SLAM that closes a loop moves its past poses; save them as a trajectory (TUM's form: time tx ty tz qx qy qz qw, the
 times those of the robot's scans), and give it here. Each measurement is integrated again from its kept scans at the new
 poses, and takes the place of the old one: as they sync, all maps become the one that these poses would have given from
-the start, byte for byte. A robot keeps scans with --keep-scans MB (`cairn robot run`, `replay`). It needs no link.
+the start, byte for byte. A robot keeps scans with --keep-scans MB (`cairn robot run`, `replay`, `live`); amend needs no
+link.
 
 A scan's pose is interpolated between neighbours at most --max-pose-gap apart. If the trajectory does not cover all
 scans, nothing is moved and the message says how many are outside and where; --skip-bad moves the measurements that are

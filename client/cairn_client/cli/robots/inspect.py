@@ -11,12 +11,14 @@ import numpy as np
 
 from cairn_client.cli.arguments import Subparsers, say, shown_bytes
 from cairn_client.cli.source_arguments import add_source_arguments, asked_source
+from cairn_client.sync.responses import one_line
 from cairn_fusion.recording.view_agreement import pose_doubt
 from cairn_fusion.recording.way_doubts import way_doubts
-from cairn_map.errors import BadInputError, ConflictError
+from cairn_map.errors import USAGE, BadInputError, ConflictError
 from cairn_map.progress import counting
 
 if TYPE_CHECKING:
+    from cairn_client.live.foxglove_source import FoxgloveSource
     from cairn_fusion.ros.bag_index import TopicIndex
     from cairn_fusion.ros.bag_recording import Survey
 
@@ -43,8 +45,15 @@ def _inspect(args: argparse.Namespace) -> int:
     from cairn_fusion.importers import SourceLayout, detect_layout
 
     if isinstance(args.bag, str):
+        from cairn_client.live.foxglove_source import FoxgloveSource
+
         _check_output(args)
-        return _show_survey(args, _listen(args.bag, args.seconds))
+        try:
+            source = FoxgloveSource(args.bag)
+        except BadInputError as exc:
+            sys.stderr.write(f"cairn robot inspect: {one_line(exc.message)} [{exc.kind}]\n")
+            return USAGE
+        return _show_survey(args, _listen(source, args.seconds))
     is_bag = args.depth is None and detect_layout(args.bag) is SourceLayout.BAG
     if not is_bag or args.topics is not None:
         _show_source(args)
@@ -57,14 +66,12 @@ def _inspect(args: argparse.Namespace) -> int:
     return _show_survey(args, found)
 
 
-def _listen(url: str, seconds: float) -> "Survey":
+def _listen(source: "FoxgloveSource", seconds: float) -> "Survey":
     """Survey of a live robot."""
-    from cairn_client.live.foxglove_source import FoxgloveSource
     from cairn_client.live.live_opening import survey_live
 
-    source = FoxgloveSource(url)
     try:
-        with counting(url, "messages") as on_message:
+        with counting(source.url, "messages") as on_message:
             return survey_live(source, seconds=seconds, on_message=on_message)
     finally:
         source.close()

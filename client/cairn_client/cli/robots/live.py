@@ -3,7 +3,7 @@
     $ cairn robot inspect ws://robot:8765 --output live.yaml          # which topics are what; a file to edit
     $ cairn robot live ws://robot:8765 --topics live.yaml --map http://base:8750/maps/lab --voxel 0.05 --name mole
     mole: 2.1 scans/s of 15.0 (12.9/s not moved), newest 0.2 s old, 1 commits wait
-    ^Cmapped 310 scans of 9000 as 62 commits; 8690 not moved; 0 commits wait
+    ^Cmapped 310 scans of 9000 as 104 commits; 8690 not moved; 0 commits wait
 
 Any robot with ROS 2 or ROS 1 has a door for it: sudo apt install ros-$ROS_DISTRO-foxglove-bridge, then ros2 launch
 foxglove_bridge foxglove_bridge_launch.xml. cairn needs no ROS. Run it on the robot: images then stay there, and only

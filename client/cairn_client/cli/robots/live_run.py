@@ -16,6 +16,7 @@ from cairn_client.live.live_mapping import LiveMapping
 from cairn_client.live.live_opening import OpenedLive, open_live, survey_live
 from cairn_client.live.live_status import LiveStatus, StatusWatch
 from cairn_client.robot.robot import Robot
+from cairn_client.sync.responses import one_line
 from cairn_fusion.ros.scan_decoder import ScanDecoder
 from cairn_fusion.ros.topic_mapping import BagMapping, mapping_from_yaml, mapping_of
 from cairn_map.codec.cell_code import Profile
@@ -66,7 +67,7 @@ def run_live(args: argparse.Namespace) -> int:
         except CairnError as exc:
             if source is not None:
                 source.close()
-            sys.stderr.write(f"cairn robot live: {exc.message} [{exc.kind}]\n")
+            sys.stderr.write(f"cairn robot live: {one_line(exc.message)} [{exc.kind}]\n")
             return USAGE
         return _map(args, source, mapping, opened, robot, stopping)
 
@@ -118,7 +119,7 @@ def _map(
         gate_of(args, is_standard=True),
         profile=Profile(args.profile) if args.profile else None,
     )
-    watch = StatusWatch(robot.name, source, opened.scans, live, opened.topics, time.monotonic())
+    watch = StatusWatch(robot.name, source, opened.scans, live, opened.topics, time.monotonic(), opened.dropped)
     shown = _ShownStatus(watch, robot, as_json=args.json)
     try:
         with lines_on_stderr(robot.events()):
@@ -179,5 +180,5 @@ class _ShownStatus:
             say(status.model_dump_json())
             sys.stdout.flush()
         else:
-            self._line.show(self._watch.line(status))
+            self._line.show(one_line(self._watch.line(status)))
         return status
