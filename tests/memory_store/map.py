@@ -137,7 +137,7 @@ class MemoryMap:
         admit_commit(self.keys, commit.id.author, commit.grounds)
         top, _ = self.authors.get(commit.id.author, (0, 0))
         if commit.marks:
-            check_marks(commit, self._held_marks(commit.id.author.robot))
+            check_marks(commit, self._held_marks(commit.id.author.robot, without=commit.retracts))
         self.authors[commit.id.author] = max(top, commit.id.n), intervals
         self.commits[commit.id] = Kept(
             number=len(self.ids),
@@ -277,9 +277,9 @@ class MemoryMap:
         check_number(commit, numbering)
         return intervals + 1 - neighbours
 
-    def _held_marks(self, robot: str) -> int:
-        """Marks of a robot that are not taken out."""
-        own = (kept for commit, kept in self.commits.items() if commit.author.robot == robot)
+    def _held_marks(self, robot: str, *, without: tuple[CommitId, ...]) -> int:
+        """Marks of a robot that are not taken out, nor of some of its commits."""
+        own = (kept for commit, kept in self.commits.items() if commit.author.robot == robot and commit not in without)
         return sum(len(kept.new.marks) for kept in own if not kept.unfolded_seq)
 
     def shares(self) -> list[RobotShares]:

@@ -90,8 +90,8 @@ class MemorySnapshot:
         kept = self._state.commits.get(commit)
         return kept.new.diff.get(key) if kept else None
 
-    def marks(self, *, after_seq: int, limit: int, box: MarkBox | None = None) -> list[MarkChange]:
-        """Marks that changed after a log entry, in a box, oldest first: whole entries, with `limit` marks or more."""
+    def marks(self, *, after_seq: int | None, limit: int, box: MarkBox | None = None) -> list[MarkChange]:
+        """Marks that changed after a log entry, or those of the map, in a box, oldest first: as `Snapshot.marks`."""
         found = [
             MarkChange(
                 seq=kept.unfolded_seq or kept.folded_seq,
@@ -103,7 +103,9 @@ class MemorySnapshot:
             for number, mark in enumerate(kept.new.marks)
             if kept.folded_seq is not None and (box is None or overlap(mark.low_mm, mark.high_mm, box))
         ]
-        found = sorted((change for change in found if change.seq > after_seq), key=lambda change: change.seq)
+        if after_seq is None:
+            found = [change for change in found if change.record is not None]
+        found = sorted((change for change in found if change.seq > (after_seq or 0)), key=lambda change: change.seq)
         return [change for change in found if change.seq <= found[min(limit, len(found)) - 1].seq]
 
     def tip(self, author: Author) -> tuple[int, bytes] | None:

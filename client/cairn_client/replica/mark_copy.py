@@ -6,14 +6,17 @@
 It is the server's word. What a robot marked itself, and is not in it yet, is in the outbox.
 """
 
+import logging
+
 from cairn_client.replica.replica_store import ReplicaStore
-from cairn_map.errors import BadInputError
 from cairn_map.wire.mark_messages import MarkEntry, MarkPage
 
 CURSOR, ENTRY = "marks-cursor", "mark "
 """Key of the cursor, and first letters of those of entries, among the texts of the folder."""
 MARKS_MAX = 1 << 17
-"""Most marks in a copy, some 100 MB with the longest texts."""
+"""Most marks in a copy, some 100 MB with the longest texts; what came beyond them is left out."""
+
+log = logging.getLogger(__name__)
 
 
 class MarkCopy:
@@ -21,6 +24,8 @@ class MarkCopy:
 
     def __init__(self, store: ReplicaStore) -> None:
         self._store = store
+        self._is_full = False
+        """True once it was logged that marks are left out."""
 
     @property
     def cursor(self) -> str | None:
@@ -31,20 +36,24 @@ class MarkCopy:
         """Take a page that goes on from the copy's cursor; all of it or nothing.
 
         Raises:
-            BadInputError: kind `too_many_marks`: the copy would have more than `MARKS_MAX`.
             UnreachableError: kind `store_failed`.
         """
         with self._store.transaction():
-            known = self._store.keys(ENTRY)
             gone = set(page.removed)
-            for key in known:
+            known = set(self._store.keys(ENTRY))
+            for key in sorted(known):
                 if page.from_start or key.removeprefix(ENTRY).partition(":")[0] in gone:
                     self._store.put(key, None)
+                    known.remove(key)
             for entry in page.marks:
-                self._store.put(f"{ENTRY}{entry.key}", entry.model_dump_json())
+                key = f"{ENTRY}{entry.key}"
+                if key in known or len(known) < MARKS_MAX:
+                    self._store.put(key, entry.model_dump_json())
+                    known.add(key)
+                elif not self._is_full:
+                    log.warning("a robot keeps %d marks of a map; the server has more, which are left out", MARKS_MAX)
+                    self._is_full = True
             self._store.put(CURSOR, page.cursor)
-            if len(known) + len(page.marks) > MARKS_MAX and len(self._store.keys(ENTRY)) > MARKS_MAX:
-                raise BadInputError("too_many_marks", f"a robot keeps {MARKS_MAX} marks of a map, the server has more")
 
     def entries(self) -> list[MarkEntry]:
         """All marks of the copy, by key."""

@@ -275,7 +275,11 @@ class Outbox:
     def has_evidence(self, commit: CommitId) -> bool:
         """False if a commit is known to hold none, nor marks."""
         kept = self._commits.get(commit)
-        return kept is None or bool(kept.cells) or self._store.get(f"{MARKS_KEY} {commit}") is not None
+        return kept is None or bool(kept.cells) or self.has_marks(commit)
+
+    def has_marks(self, commit: CommitId) -> bool:
+        """True if a commit that was made here brought marks."""
+        return self._store.get(f"{MARKS_KEY} {commit}") is not None
 
     def meta(self, commit: CommitId) -> CommitMeta | None:
         """Meta of a commit; None if its bytes are not kept any more."""
@@ -360,8 +364,8 @@ class Outbox:
         return renamed
 
     def _note_marks(self, commit: Commit) -> None:
-        """Remember of an edit that it brought marks: it may be taken out when its bytes are gone."""
-        if commit.meta.marks and commit.meta.retracts:
+        """Remember of a commit that it brought marks: it may be taken out when its bytes are gone."""
+        if commit.meta.marks:
             self._store.put(f"{MARKS_KEY} {commit.id}", "")
 
     def _naming(self, old: CommitId, new: CommitId) -> Iterator[Commit]:

@@ -30,12 +30,13 @@ from cairn_map.codec.cell_code import Profile
 from cairn_map.commits.commit import Commit, CommitMeta
 from cairn_map.commits.cursor import Cursor, cursor_from_text
 from cairn_map.commits.ids import OPERATOR, Author, CommitId, RobotName
+from cairn_map.commits.mark import Mark
 from cairn_map.commits.signature import Signature
 from cairn_map.commits.version_vector import EMPTY
 from cairn_map.epochs.cell_history import CellHistory
 from cairn_map.epochs.history_map import HistoryMap
 from cairn_map.epochs.layer import MapLayer
-from cairn_map.errors import BadInputError, CairnError, ConflictError, UnreachableError
+from cairn_map.errors import BadInputError, CairnError, ConflictError, NotFoundError, UnreachableError
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.fingerprint import Fingerprint
 from cairn_map.evidence.grid import Cell, CellKey, Geometry, cell_of_key
@@ -55,6 +56,8 @@ BAD_CLOCK = "bad_clock"
 """Kind of the refusal of a commit whose time the server cannot judge, or that is still to come for it."""
 KINDS_OF_ALL = ("http", "unknown_protocol")
 """Kinds of refusals that say nothing about the commit: a portal's or proxy's, and those of every request."""
+KINDS_OF_MARKS = ("too_many_marks", "older_servers")
+"""Kinds of refusals of a commit for its marks: the robot has too many, or the server's store takes none yet."""
 FORGET_AT_ONCE = 32
 """Commits dropped at once for room: a few, so that no more go than must."""
 RETRACTS_AT_ONCE = 1024
@@ -88,7 +91,9 @@ class RefusedPushes:
         """Note that the server refused a commit; it rests if that was for its bytes or its time."""
         if refusal.kind == BAD_CLOCK and isinstance(refusal, UnreachableError):
             self._commits[commit] = refusal, self._steady_s() + min(refusal.retry_after_s or EARLY_S, REST_S)
-        elif isinstance(refusal, BadInputError) and refusal.kind not in KINDS_OF_ALL:
+        elif refusal.kind in KINDS_OF_MARKS or (
+            isinstance(refusal, BadInputError) and refusal.kind not in KINDS_OF_ALL
+        ):
             self._commits[commit] = refusal, self._steady_s() + REST_S
 
     def of(self, commit: CommitId) -> CairnError | None:
@@ -98,6 +103,11 @@ class RefusedPushes:
             del self._commits[commit]
             return None
         return refusal
+
+    def of_marks(self) -> tuple[CommitId, CairnError] | None:
+        """A commit that was refused for its marks, and not taken since, with the refusal; called by any thread."""
+        found = self._commits.copy().items()
+        return next(((commit, said) for commit, (said, _) in found if said.kind in KINDS_OF_MARKS), None)
 
     def forget_commits(self) -> None:
         """Try all commits again: another server may take them."""
@@ -288,10 +298,31 @@ class Replica:
             ConflictError: kind `taken_back`: it was taken out, and nothing stands for it.
         """
         with self._lock:
-            latest = self.outbox.successors.latest(target)
-            if latest != target and not self.outbox.has_evidence(latest):
-                raise ConflictError("taken_back", f"{target} was taken back before, by {latest}; there is nothing left")
-            return self.commit({}, replace(facts, retracts=(latest,)))
+            return self.commit({}, replace(facts, retracts=(self._standing(target),)))
+
+    def mark(self, mark: Mark, *, instead_of: CommitId | None) -> Commit:
+        """Keep a mark, perhaps in the place of what stands for an own commit with marks; as `commit`.
+
+        Raises:
+            NotFoundError: kind `no_mark`: the commit brought no marks.
+            ConflictError: kind `taken_back`, as of `retract`; or the server refuses marks of this robot, by its kind.
+        """
+        with self._lock:
+            # Each commit that is refused for good leaves a gap in the numbers, of which a map takes few.
+            if (refusal := self.refusals.of_marks()) is not None:
+                commit, said = refusal
+                raise ConflictError(said.kind, f"no more marks until the server takes {commit}: {said.message}")
+            target = None if instead_of is None else self._standing(instead_of)
+            if target is not None and self.outbox.knows(target) and not self.outbox.has_marks(target):
+                raise NotFoundError("no_mark", f"{target} brought no marks that another could take the place of")
+            return self.commit({}, CommitFacts(marks=(mark,), retracts=() if target is None else (target,)))
+
+    def _standing(self, target: CommitId) -> CommitId:
+        """Commit that stands for another one, or itself; it can be taken out."""
+        latest = self.outbox.successors.latest(target)
+        if latest != target and not self.outbox.has_evidence(latest):
+            raise ConflictError("taken_back", f"{target} was taken back before, by {latest}; there is nothing left")
+        return latest
 
     def has_made(self, commit: CommitId) -> bool:
         """True if a commit was made in this folder, even if its bytes are gone."""
@@ -370,9 +401,9 @@ class Replica:
                 self._base.refresh_commits([commit])
 
     def lacking_retracts(self) -> list[CommitId]:
-        """The operator's retracts that a restore could still lose, and that are not kept here yet.
+        """The operator's commits that a restore could still lose, and that are not kept here yet.
 
-        Everything that the operator says is a retract, so the vectors name them all; `RETRACTS_AT_ONCE` at most.
+        They are retracts and marks, without evidence, so that all of them are fetched; `RETRACTS_AT_ONCE` at most.
         """
         with self._lock:
             if self.header is None:

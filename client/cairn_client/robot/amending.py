@@ -96,8 +96,7 @@ class Amending:
     def mark(self, mark: Mark, *, instead_of: AnyCommit | None) -> Commit:
         """Commit a mark, perhaps in the place of an own one; as `Robot.mark`."""
         check_place(mark, self._replica.geometry)
-        retracts = () if instead_of is None else (commit_id_of(instead_of),)
-        commit = self._replica.commit({}, CommitFacts(marks=(mark,), retracts=retracts))
+        commit = self._replica.mark(mark, instead_of=None if instead_of is None else commit_id_of(instead_of))
         self._on_commit(commit)
         return commit
 

@@ -475,6 +475,7 @@ class Robot:
 
         Raises:
             BadInputError: kind `bad_mark`, `bad_place`, or `not_own`: another's, which an operator changes.
+            CairnError: kind `no_mark` or `taken_back`: `instead_of` is no mark any more; or the server takes none.
             UnreachableError: kind `store_failed`: the disk is full or broken.
         """
         time_s = self._clock.best_s()  # the server's, if it was learnt

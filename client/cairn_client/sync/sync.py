@@ -133,6 +133,7 @@ def push_commits(
         except ConflictError as exc:
             log.error("the server will not take commit %s: %s: %s", commit_id, exc.kind, exc.message)
             report.refused[commit_id] = exc
+            replica.refusals.note(commit_id, exc)
             continue
         except DeniedError as exc:
             if exc.kind not in ("not_allowed", "not_admitted"):  # the token is not good: no fault of the commit

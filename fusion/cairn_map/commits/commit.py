@@ -129,6 +129,12 @@ class CommitMeta(BaseModel):
             raise ValueError(f"this reader knows commits of {LAYERS_MAX} layer, got {len(self.layers)}")
         if self.marks and (self.layers or len(self.retracts) > AMENDED_MAX):
             raise ValueError(f"a commit with marks names its geometry, and at most {AMENDED_MAX} commits to retract")
+        # Each mark is listed with the commits that its commit takes out.
+        if len(self.marks) * len(self.retracts) > MARKS_MAX:
+            raise ValueError(
+                f"{len(self.marks)} marks take the place of at most {MARKS_MAX // len(self.marks)} commits, "
+                f"got {len(self.retracts)}"
+            )
         return self
 
     @property

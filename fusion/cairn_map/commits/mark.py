@@ -31,8 +31,13 @@ TIME_MS_MAX = 10**14
 NAME_MAX, NOTE_MAX = 64, 1024
 """Code points."""
 KIND = r"^[a-z][a-z0-9_]{0,31}$"
-FORBIDDEN = re.compile("[\u0000-\u0009\u000b-\u001f\u007f-\u009f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
-"""Characters that no text of a mark has: controls, and those that turn the order of what is read; a note has lines."""
+FORBIDDEN = re.compile(
+    "[\u0000-\u0009\u000b-\u001f\u007f-\u009f\u061c\u200b\u200e\u200f\u2028-\u202e\u2066-\u2069\ufeff\ud800-\udfff]"
+)
+"""Characters that no text of a mark has: controls, those that turn the order of what is read, and two spaces of no
+width. A note has lines; scripts and emoji need the joiners U+200C and U+200D."""
+BLANK = re.compile("[\\s\u200c\u200d]+")
+"""White space and joiners: a name has more than these."""
 MARK_ID = re.compile(r"(?P<commit>[^:]{1,96})(?::(?P<number>0|[1-9][0-9]{0,3}))?")
 
 
@@ -48,6 +53,8 @@ def _check_note(text: str) -> str:
 def _check_line(text: str) -> str:
     if "\n" in text:
         raise ValueError("a name is one line; what needs several goes into the note")
+    if BLANK.fullmatch(text):
+        raise ValueError("a name has a character that is seen")
     return _check_note(text)
 
 

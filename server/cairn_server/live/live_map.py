@@ -154,8 +154,10 @@ class LiveChanges:
         if cells or is_many:  # a retract of what never came changes no cell
             events.append(CellsEvent(id=str(seen), cells="many" if is_many else cells))
         if marks or not has_all_marks:
-            came: list[MarkEntry] | Literal["many"] = entries_of(marks) if has_all_marks else "many"
-            removed = list(map(str, removed_commits(marks))) if has_all_marks else []
+            gone = removed_commits(marks) if has_all_marks else []
+            living = (change for change in marks if change.key.commit not in gone)
+            came: list[MarkEntry] | Literal["many"] = entries_of(living) if has_all_marks else "many"
+            removed = list(map(str, gone))
             events.append(MarksEvent(id=str(seen), marks=came, removed=removed))
         events.append(LogGrew(id=str(seen), entries=entries, left_out=head.seq - seen.seq - len(entries)))
         return [*events, HeadMoved(id=str(moved), cursor=str(head))], moved

@@ -18,7 +18,7 @@ from collections.abc import Iterable, Sequence
 from operator import gt, truediv
 from typing import Any
 
-from cairn_map.commits.ids import SERVERS_OWN
+from cairn_map.commits.ids import SERVERS_OWN, CommitId
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.evidence import COUNT_MAX, SUM_MAX
 from cairn_map.evidence.grid import CellKey, Geometry, cell_of_key
@@ -185,7 +185,7 @@ def check_marks(commit: NewCommit, held: int) -> None:
 
     Args:
         commit: with marks.
-        held: marks of its robot that are not taken out.
+        held: marks of its robot that are not taken out, nor to be taken out by it.
 
     Raises:
         BadInputError: kind `too_many_marks`.
@@ -198,3 +198,8 @@ def check_marks(commit: NewCommit, held: int) -> None:
             f"{robot} has {held} marks on this map, of at most {most}: take old ones out (cairn map mark --remove), "
             "and push this again",
         )
+
+
+def own_targets(commit: NewCommit) -> list[CommitId]:
+    """Commits of its own robot that a commit takes out: their marks leave room for its own."""
+    return [target for target in commit.retracts if target.author.robot == commit.id.author.robot]

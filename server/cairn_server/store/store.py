@@ -146,10 +146,10 @@ class Snapshot(Protocol):
         """Log entries, oldest first, without what they say."""
         ...
 
-    def marks(self, *, after_seq: int, limit: int, box: MarkBox | None = None) -> list[MarkChange]:
+    def marks(self, *, after_seq: int | None, limit: int, box: MarkBox | None = None) -> list[MarkChange]:
         """Marks that changed after a log entry, by entry and number: whole entries, so `limit` of them or more.
 
-        With a box those whose own boxes overlap it. Fewer than `limit` are the last ones.
+        After None, those of the map. With a box those whose own boxes overlap it. Fewer than `limit` are the last ones.
         """
         ...
 

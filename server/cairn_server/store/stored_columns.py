@@ -107,9 +107,14 @@ def corner_values(box: MarkBox) -> tuple[int, ...]:
     return (*high, *low)
 
 
-def mark_change(
-    seq: int, robot: str, incarnation: str, n: int, number: int, record: str | None, retracts: str
-) -> MarkChange:
-    """Change of a mark from its columns, and those of its commit."""
-    author = Author(RobotName(robot), Incarnation(incarnation))
-    return MarkChange(seq, MarkKey(CommitId(author, n), number), record, ids_from_text(retracts))
+def mark_changes(found: Iterable[Sequence[Any]]) -> list[MarkChange]:
+    """Changes of marks from their columns and those of their commits, whose `retracts` come last."""
+    # Marks of one commit stand together, and what it takes out is parsed once for all of them.
+    last: tuple[str, tuple[CommitId, ...]] = ("", ())
+    changes: list[MarkChange] = []
+    for seq, robot, incarnation, n, number, record, retracts in found:
+        if retracts != last[0]:
+            last = retracts, ids_from_text(retracts)
+        author = Author(RobotName(robot), Incarnation(incarnation))
+        changes.append(MarkChange(seq, MarkKey(CommitId(author, n), number), record, last[1]))
+    return changes

@@ -52,12 +52,13 @@ class Marking:
         with self._store.snapshot(row) as snapshot:
             head = snapshot.head
             is_known = stated is not None and stated.log_id == head.log_id and is_proven(stated, snapshot)
-            start = stated.seq if stated is not None and is_known else 0
-            found = snapshot.marks(after_seq=start, limit=limit, box=asked)
+            found = snapshot.marks(
+                after_seq=stated.seq if stated is not None and is_known else None, limit=limit, box=asked
+            )
             more = len(found) >= limit
             cursor = _cursor_at(found[-1].seq, snapshot) if more else head
-        # From the start nothing is left to remove.
-        removed = list(map(str, removed_commits(found))) if is_known else []
+        # From the start there is none to remove.
+        removed = list(map(str, removed_commits(found)))
         return MarkPage(
             cursor=str(cursor), from_start=not is_known, more=more, marks=entries_of(found), removed=removed
         )

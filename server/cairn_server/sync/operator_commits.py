@@ -1,11 +1,12 @@
 """Commits that a server makes for its operators: their author, and numbers that this server never used before."""
 
+import threading
 from collections.abc import Callable
 
 from cairn_map.commits.commit import CommitMeta, make_commit
 from cairn_map.commits.ids import OPERATOR, Author, CommitId, new_incarnation
 from cairn_map.commits.mark import Mark
-from cairn_map.errors import ConflictError
+from cairn_map.errors import BadInputError, ConflictError
 from cairn_server.store.store import Store
 from cairn_server.store.store_rows import MapRow, NewCommit
 
@@ -17,6 +18,7 @@ class OperatorCommits:
         self._store = store
         self.operator = new_incarnation()
         """Incarnation of the author, new with every start: a restored server must not reuse the numbers it lost."""
+        self._lock = threading.Lock()
         self._next: dict[tuple[int, Author], int] = {}
         """Next number, by map and author; a lower one says that the store was restored while this server ran."""
 
@@ -31,18 +33,32 @@ class OperatorCommits:
         """
         author = Author(OPERATOR, self.operator)
         build = _builder(row, author, retracts, note, marks)
+        key = row.number, author
+        tried: list[int] = []
 
         def build_next(n: int) -> NewCommit:
-            if n < self._next.get((row.number, author), 0):
+            if n < self._next.get(key, 0):
                 raise _LostNumberError("id_taken", f"{CommitId(author, n)} was another commit, which was lost")
-            self._next[row.number, author] = n + 1
+            tried.append(n)
             return build(n)
 
         try:
-            return self._store.append_built(row, author, build_next).id
+            commit = self._store.append_built(row, author, build_next).id
         except _LostNumberError:
             self.operator = new_incarnation()
             return self.append(row, retracts=retracts, note=note, marks=marks)
+        except (BadInputError, ConflictError):  # refused, so that the number stays free
+            raise
+        except Exception:  # it may be kept: the number counts as used
+            self._use(key, tried)
+            raise
+        self._use(key, [commit.n])
+        return commit
+
+    def _use(self, key: tuple[int, Author], numbers: list[int]) -> None:
+        """Note numbers that no other commit may have."""
+        with self._lock:
+            self._next[key] = max([self._next.get(key, 0), *(n + 1 for n in numbers)])
 
 
 class _LostNumberError(ConflictError):

@@ -6,14 +6,19 @@ import pytest
 from tests.fixtures.client.live_server import LiveServer
 from tests.fixtures.client.made import MAP, A, cells_of, seen
 from tests.fixtures.client.robots import NOWHERE, map_commit, robot_in
+from tests.fixtures.map.made import made_cursor
+from tests.fixtures.map.marks import mark
 
 from cairn_client.http.api import MapApi
+from cairn_client.replica import mark_copy
 from cairn_map.commits.commit_reading import open_commit
 from cairn_map.commits.version_vector import EMPTY
-from cairn_map.errors import BadInputError, ConflictError, UnreachableError
-from cairn_map.wire.mark_messages import MarkRequest, MarkText, edited_twice
+from cairn_map.errors import BadInputError, CairnError, ConflictError, NotFoundError, UnreachableError
+from cairn_map.wire.mark_messages import MarkEntry, MarkPage, MarkRequest, MarkText, edited_twice
 from cairn_map.wire.messages import CreateMap
+from cairn_server.store.sqlite import changes
 
+WREN = "wren.0123456789abcdef"
 PLACE = (0.5, -0.25, 1.0)
 
 
@@ -130,3 +135,78 @@ def test_what_cannot_be_is_refused_and_nothing_is_lost(tmp_path: Path, fields: d
         robot.mark("lamp", PLACE)
         assert robot.waiting == 2
         robot.close(flush_s=0)
+
+
+def test_each_change_of_a_mark_takes_the_place_of_the_last_one_under_any_of_its_names(tmp_path: Path) -> None:
+    with robot_in(tmp_path) as robot:
+        first = robot.mark("lamp", PLACE)
+        second = robot.mark("lamp, off", PLACE, instead_of=first)
+        third = robot.mark("lamp, hot", PLACE, instead_of=first)
+        assert (second.meta.retracted_ids, third.meta.retracted_ids) == ((first.id,), (second.id,))
+        # The server has another commit under that id (SYNC.md rule 13).
+        alone = robot.mark("door", PLACE)
+        renamed = robot.replica.rename(alone.id)
+        assert robot.mark("door, open", PLACE, instead_of=alone).meta.retracted_ids == (renamed,)
+        alone = robot.mark("stairs", PLACE)
+        renamed = robot.replica.rename(alone.id)
+        assert robot.retract(alone).meta.retracted_ids == (renamed,)
+        with pytest.raises(ConflictError) as gone:
+            robot.mark("stairs", PLACE, instead_of=alone)
+        assert gone.value.kind == "taken_back"
+        measured = map_commit(robot, 1)
+        with pytest.raises(NotFoundError) as refused:
+            robot.mark("lamp", PLACE, instead_of=measured)
+        assert refused.value.kind == "no_mark"
+        robot.close(flush_s=0)
+
+
+@pytest.mark.parametrize(
+    "refusal", [BadInputError("too_many_marks", "it has 3"), ConflictError("older_servers", "some are older")]
+)
+def test_after_a_mark_was_refused_no_other_tears_the_numbers_further(
+    server: LiveServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refusal: CairnError
+) -> None:
+    def refuse(commit: object, held: int) -> None:
+        raise refusal
+
+    with robot_in(tmp_path, server.map_url) as robot:
+        with monkeypatch.context() as full:
+            full.setattr(changes, "check_marks", refuse)
+            first = robot.mark("lamp", PLACE)
+            robot.sync()
+            with pytest.raises(ConflictError, match=str(first.id)) as refused:
+                robot.mark("door", PLACE)
+            assert refused.value.kind == refusal.kind
+        map_commit(robot, 1)
+        robot.sync()
+        assert robot.waiting == 1
+        robot.close(flush_s=0)
+    # A new start tries it again, and then marks go on.
+    with robot_in(tmp_path, server.map_url) as robot:
+        robot.sync()
+        robot.mark("door", PLACE)
+        robot.sync()
+        assert not robot.waiting
+
+
+def test_a_copy_that_is_full_leaves_marks_out_says_so_once_and_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(mark_copy, "MARKS_MAX", 3)
+
+    def page(seq: int, *keys: str, removed: tuple[str, ...] = ()) -> MarkPage:
+        entries = [MarkEntry(key=f"{WREN}.{key}", mark=mark()) for key in keys]
+        cursor = str(made_cursor(seq))
+        return MarkPage(cursor=cursor, from_start=seq == 1, more=False, marks=entries, removed=list(removed))
+
+    with robot_in(tmp_path) as robot:
+        copy = robot.replica.marks
+        pages = [page(1, "0:0", "0:1"), page(2, "1:0", "2:0"), page(3, "3:0", removed=(f"{WREN}.0",)), page(4, "4:0")]
+        counts = []
+        for each in pages:
+            copy.take(each)
+            assert copy.cursor == each.cursor
+            counts.append(len(copy.entries()))
+        assert counts == [2, 3, 2, 3]
+        copy.take(page(5, "5:0"))
+        assert [record.levelname for record in caplog.records if "left out" in record.message] == ["WARNING"]

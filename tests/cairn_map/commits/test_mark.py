@@ -40,17 +40,18 @@ from cairn_map.errors import BadInputError, CairnError
 from cairn_map.evidence.grid import cell_key
 
 WREN = "wren.00112233445566aa"
+IDS = [f"{WREN}.{n}" for n in range(AMENDED_MAX)]
 lengths = st.integers(-MILLIMETRES_MAX, MILLIMETRES_MAX)
 texts = st.text(st.characters(exclude_categories=("C", "Zl", "Zp")), min_size=1, max_size=20)
 marks = st.builds(
     Mark,
     kind=st.from_regex(r"\A[a-z][a-z0-9_]{0,31}\Z"),
-    name=texts,
+    name=texts.filter(str.strip),
     place_mm=st.tuples(lengths, lengths, lengths),
     extent_mm=st.tuples(*[st.integers(0, MILLIMETRES_MAX)] * 3),
     note=texts,
     time_ms=st.integers(-(10**14), 10**14),
-    by=texts,
+    by=texts.filter(str.strip),
 )
 
 
@@ -126,6 +127,7 @@ def test_a_commit_with_marks_is_of_any_map_of_its_grid() -> None:
         (with_meta(epoch=3), "bad_commit"),
         (with_meta(marks=[json.loads(mark().to_json())] * (MARKS_MAX + 1)), "too_many_marks"),
         (with_meta(retracts=[f"{WREN}.{n}" for n in range(AMENDED_MAX + 1)]), "bad_commit"),
+        (with_meta(retracts=IDS, marks=[json.loads(mark().to_json())] * (MARKS_MAX // AMENDED_MAX + 1)), "bad_commit"),
         (commit_bytes(MADE.text, {cell_key((0, 0, 0)): b"cell"}, version=MARK_VERSION), "bad_commit"),
         (with_mark(kind="Hot spot"), "bad_commit"),
         (with_mark(name=""), "bad_commit"),
@@ -133,6 +135,10 @@ def test_a_commit_with_marks_is_of_any_map_of_its_grid() -> None:
         (with_mark(name="two\nlines"), "bad_commit"),
         (with_mark(name="\x1b[2J"), "bad_commit"),
         (with_mark(note="from right \u202e to left"), "bad_commit"),
+        (with_mark(note="from right \u200f to left"), "bad_commit"),
+        (with_mark(name="no\u200bwidth"), "bad_commit"),
+        (with_mark(name="\u00a0 \u3000"), "bad_commit"),
+        (with_mark(name="\u200d"), "bad_commit"),
         (with_mark(note="\ud800"), "bad_commit"),
         (with_mark(note="n" * 1025), "bad_commit"),
         (with_mark(by="a\u2028b"), "bad_commit"),

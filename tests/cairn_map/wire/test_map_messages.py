@@ -8,8 +8,16 @@ from tests.fixtures.map.made import SMALL, made_cursor
 
 from cairn_map.epochs.epoch import EPOCH_S_MAX
 from cairn_map.epochs.layer import MapLayer
+from cairn_map.errors import DamagedDataError
 from cairn_map.evidence.inverse_sensor_model import SensorModel
-from cairn_map.wire.messages import CreateMap, MapInfo, Registered
+from cairn_map.wire.messages import (
+    JSON_FIELDS_MAX,
+    JSON_VALUES_MAX,
+    CreateMap,
+    MapInfo,
+    Registered,
+    check_json_size,
+)
 
 OLD_INFO = {
     "name", "geometry", "sensor_model", "cursor", "cells", "size_bytes", "commits", "branches", "box_m", "server_key",
@@ -48,3 +56,19 @@ def test_epochs_and_history_are_read_as_they_were_written() -> None:
 def test_a_length_of_epochs_that_cannot_be_is_refused(epoch_s: object) -> None:
     with pytest.raises(ValidationError):
         CreateMap.model_validate({"epoch_s": epoch_s})
+
+
+@pytest.mark.parametrize("text", [":" * JSON_FIELDS_MAX, '\\",[{:' * JSON_FIELDS_MAX, "\\\\", '\\\\\\"' + ":" * 9])
+def test_separators_in_a_text_are_no_values(text: str) -> None:
+    said = json.dumps({"note": text, "more": ["\\", '"', text, text + ":"]})
+    for sent in (said, said.encode()):
+        check_json_size(sent)
+
+
+@pytest.mark.parametrize("left", ['"a\\\\",', '"\\"",', "1,", '{"":0},', '"' + ":," * 9 + '",'])
+def test_separators_outside_of_texts_are_values_whatever_stands_between_them(left: str) -> None:
+    said = f"[{left * JSON_VALUES_MAX}0]"
+    for sent in (said, said.encode(), said.encode()[:-1]):
+        with pytest.raises(DamagedDataError) as refused:
+            check_json_size(sent)
+        assert refused.value.kind == "too_many_values"

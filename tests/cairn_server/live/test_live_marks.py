@@ -71,3 +71,15 @@ def test_more_marks_than_an_event_holds_are_many_and_entries_stay_whole(
     assert counts == ["many", 4, 2]
     fold(live, row, mark_commit(3, *[mark()] * 6, author=MOLE))
     assert [event.marks for event in news(changes, 3)] == ["many"]
+
+
+def test_a_mark_that_came_and_went_between_two_events_is_told_as_gone_alone(live: Live) -> None:
+    row = live.new_map()
+    changes = LiveChanges(live.service.store, row)
+    changes.read()
+    fold(live, row, mark_commit(0, mark(), author=MOLE))
+    changes.read()
+    fold(live, row, mark_commit(1, mark("off"), author=MOLE, retracts=(f"{MOLE}.0",)))
+    (event,) = news(changes, 0)
+    assert event.marks != "many" and [entry.mark.name for entry in event.marks] == ["off"]
+    assert event.removed == [f"{MOLE}.0"]

@@ -12,10 +12,12 @@ from tests.fixtures.server.answers import kind_of
 from tests.fixtures.server.live import Live
 from tests.fixtures.server.pushes import MOLE, WREN, pushed
 
-from cairn_map.commits.commit import Commit, CommitMeta, make_commit
+from cairn_map.commits.commit import META_BYTES_MAX, Commit, CommitMeta, make_commit
 from cairn_map.commits.commit_reading import open_commit
+from cairn_map.commits.ids import CommitId, commit_id_from_text
 from cairn_map.commits.mark import MARKS_MAX
 from cairn_map.wire.mark_messages import MarkPage, edited_twice
+from cairn_server.store import shares
 from cairn_server.store.store_rows import MapRow
 
 DOOR = {"kind": "door", "name": "north door", "place_m": [1.5, -2.0, 1.0], "extent_m": [0.9, 0.1, 2.0]}
@@ -243,3 +245,28 @@ def test_an_operators_mark_comes_back_to_a_server_that_lost_it_by_its_seal_alone
     assert make_commit(open_commit(fetched.content)[0].meta, {}, SMALL).data == fetched.content
     header = {"Cairn-Seal": fetched.headers["Cairn-Seal"]}
     assert live.push(row, open_commit(fetched.content)[0], headers=header).json()["state"] == "known"
+
+
+def test_a_refused_mark_of_an_operator_leaves_his_author_and_his_numbers(
+    live: Live, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    row = live.new_map()
+    before = commit_id_from_text(put(live, row, {"mark": DOOR})["commit"])
+    with monkeypatch.context() as full:
+        full.setattr(shares, "MARKS_OF_SERVERS_MAX", 1)
+        answer = live.http.post(f"/maps/{row.name}/main/marks", json={"mark": DOOR})
+        assert (answer.status_code, kind_of(answer)) == (400, "too_many_marks")
+    after = commit_id_from_text(put(live, row, {"mark": DOOR})["commit"])
+    assert after == CommitId(before.author, before.n + 1)
+
+
+def test_every_commit_of_marks_that_is_taken_leaves_an_operator_room_to_change_one(live: Live) -> None:
+    row = live.new_map()
+    long = mark(note="\u20ac" * 1024)
+    most = (META_BYTES_MAX - 4096) // (len(long.to_json().encode()) + 1)
+    answer = live.push(row, mark_commit(0, *[long] * most, author=MOLE))
+    assert (answer.status_code, kind_of(answer), "several" in answer.text) == (413, "too_large", True)
+    assert live.push(row, mark_commit(0, *[long] * (most - 5), author=MOLE)).status_code == 201
+    changed = put(live, row, {"of": f"{MOLE}.0:1", "mark": DOOR | {"note": "\U0001f6aa" * 1024}})
+    put(live, row, {"of": changed["key"]})
+    assert len(page(live, row).marks) == most - 6

@@ -153,6 +153,6 @@ def put_mark(
     caller: Annotated[Caller, Depends(allowed(Role.OPERATOR))],
     body: Annotated[MarkRequest, json_of(MarkRequest)],
 ) -> MarkReceipt:
-    """Add a mark as an operator, or change or remove anybody's; robots push commits with their own."""
+    """Add a mark as an operator, or change or remove any author's; robots push commits with their own."""
     service.acts.take(caller.name, is_admin=caller.role is Role.ADMIN)
     return service.sync.marking.put(row, body, by=caller)

@@ -209,8 +209,9 @@ def _write_entries(connection: Connection, row: MapRow, fold: Fold, age_s: float
             " WHERE map = %(map)s AND commits.number = e.number AND e.kind <> %(fold)s",
             values,
         )
-        give_back_sums(connection, row, out)
+        # Authors before accounts, as every push locks them.
         _take_marks_out(connection, values)
+        give_back_sums(connection, row, out)
 
 
 def _take_marks_out(connection: Connection, values: dict[str, object]) -> None:

@@ -17,7 +17,7 @@ from cairn_server.store.postgres.retention import check_kept, count_kept, is_ret
 from cairn_server.store.postgres.robot_keys import admit_commit
 from cairn_server.store.postgres.schema import MARKS_OLDEST, NOW_S, bar_older_programs
 from cairn_server.store.postgres.shares import CHARGE, COUNT_MARKS, charge_of, check_charge, lock_head, note_number
-from cairn_server.store.shares import check_marks
+from cairn_server.store.shares import check_marks, own_targets
 from cairn_server.store.store_rows import MapRow, NewCommit
 from cairn_server.store.stored_columns import CORNERS, epoch_to_column
 
@@ -52,6 +52,13 @@ WITH next AS (
 SELECT number FROM kept"""
 SLOW_CHARGE = CHARGE.format(source="")
 SLOW_KEEP = KEEP.format(source="")
+HELD_OF = """
+SELECT count(*) FROM unnest(%(incarnations)s::text[], %(numbers)s::bigint[]) AS target (incarnation, n)
+    JOIN commits AS c ON c.map = %(map)s AND c.robot = %(robot)s
+        AND c.incarnation = target.incarnation AND c.n = target.n
+    JOIN mark ON mark.map = c.map AND commit_number = c.number
+WHERE record IS NOT NULL"""
+"""SQL that counts the marks of a robot's commits that are not taken out."""
 INSERT_MARKS = (
     f"INSERT INTO mark (map, commit_number, n, {', '.join(CORNERS)}, record)"
     " SELECT %(map)s, %(number)s, u.* FROM unnest(%(n)s::bigint[], "
@@ -181,7 +188,15 @@ def _insert_marks(connection: Connection, row: MapRow, number: int, commit: NewC
         BadInputError: kind `too_many_marks`.
     """
     query = "SELECT coalesce(sum(marks), 0)::bigint FROM author WHERE map = %s AND robot = %s"
-    check_marks(commit, first(connection, query, (row.number, commit.id.author.robot)))
+    held: int = first(connection, query, (row.number, commit.id.author.robot))
+    targets = own_targets(commit)
+    values: dict[str, object] = {
+        "map": row.number,
+        "robot": commit.id.author.robot,
+        "incarnations": [target.author.incarnation for target in targets],
+        "numbers": [target.n for target in targets],
+    }
+    check_marks(commit, held - (first(connection, HELD_OF, values) if targets else 0))
     corners = zip(*((*mark.low_mm, *mark.high_mm) for mark in commit.marks), strict=True)
     values = {
         "map": row.number,

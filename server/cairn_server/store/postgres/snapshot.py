@@ -42,7 +42,7 @@ from cairn_server.store.stored_columns import (
     corner_values,
     epoch_from_column,
     log_entry,
-    mark_change,
+    mark_changes,
 )
 from cairn_server.store.tiles import Box, is_in_box
 
@@ -335,8 +335,8 @@ class PgSnapshot:
             for seq, kind, robot, incarnation, n, sha, chain in found
         ]
 
-    def marks(self, *, after_seq: int, limit: int, box: MarkBox | None = None) -> list[MarkChange]:
-        """Marks that changed after a log entry, in a box, oldest first: whole entries, with `limit` marks or more."""
+    def marks(self, *, after_seq: int | None, limit: int, box: MarkBox | None = None) -> list[MarkChange]:
+        """Marks that changed after a log entry, or those of the map, in a box, oldest first: as `Snapshot.marks`."""
         return _changed_marks(self._connection, self._map, after_seq=after_seq, limit=limit, box=box)
 
     def totals(self) -> Totals:
@@ -372,11 +372,11 @@ def _said(meta: bytes) -> tuple[str | None, str | None, str | None, str | None]:
 
 
 def _changed_marks(
-    connection: Connection, map_number: int, *, after_seq: int, limit: int, box: MarkBox | None
+    connection: Connection, map_number: int, *, after_seq: int | None, limit: int, box: MarkBox | None
 ) -> list[MarkChange]:
     """Marks changed after a log entry, in a box, by entry and number; as `Snapshot.marks`."""
-    where: str = "map = %s AND changed_seq > %s"
-    values: tuple[int, ...] = (map_number, after_seq)
+    where: str = "map = %s AND changed_seq > %s" + (" AND record IS NOT NULL" if after_seq is None else "")
+    values: tuple[int, ...] = (map_number, after_seq or 0)
     if box is not None:
         where, values = f"{where} AND {corner_conditions('%s')}", (*values, *corner_values(box))
     # A page ends with an entry, that of its last row, which is found along the index alone: it has the corners, too.
@@ -391,4 +391,4 @@ def _changed_marks(
         " ORDER BY changed_seq, m.n",
         values,
     )
-    return [mark_change(*row) for row in found]
+    return mark_changes(found)

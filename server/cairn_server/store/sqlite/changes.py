@@ -5,9 +5,10 @@ import time
 import apsw
 
 from cairn_map.commits.cursor import ENTRY_FOLD
+from cairn_map.commits.ids import CommitId
 from cairn_map.errors import ConflictError
 from cairn_server.store.history import KnownVectors, crosses_mark
-from cairn_server.store.shares import check_marks
+from cairn_server.store.shares import check_marks, own_targets
 from cairn_server.store.sqlite.retention import check_kept, check_lives, count_kept, is_retracted, remember_evidence
 from cairn_server.store.sqlite.robot_keys import admit_commit
 from cairn_server.store.sqlite.schema import MAPS
@@ -184,12 +185,22 @@ def _insert_marks(connection: apsw.Connection, row: MapRow, number: int, commit:
         return
     author = commit.id.author
     query = "SELECT coalesce(sum(marks), 0) FROM author WHERE map = ? AND robot = ?"
-    check_marks(commit, first(connection, query, (row.number, author.robot)))
+    held: int = first(connection, query, (row.number, author.robot))
+    check_marks(commit, held - sum(_held_of(connection, row, target) for target in own_targets(commit)))
     connection.executemany(
         INSERT_MARK,
         [(row.number, number, n, *mark.low_mm, *mark.high_mm, mark.to_json()) for n, mark in enumerate(commit.marks)],
     )
     _count_marks(connection, row, number, len(commit.marks))
+
+
+def _held_of(connection: apsw.Connection, row: MapRow, commit: CommitId) -> int:
+    """Count of the marks of a commit that are not taken out."""
+    query = (
+        "SELECT count(*) FROM mark WHERE map = ?1 AND record IS NOT NULL AND commit_number ="
+        " (SELECT number FROM commits WHERE map = ?1 AND robot = ?2 AND incarnation = ?3 AND n = ?4)"
+    )
+    return int(first(connection, query, (row.number, *commit.author, commit.n)) or 0)
 
 
 def _bring_marks(connection: apsw.Connection, row: MapRow, number: int, seq: int) -> None:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from cairn_map.codec.cell_code import CanonicalCell
 from cairn_map.codec.octree.cell_content import CellContent
-from cairn_map.commits.commit import CommitMeta
+from cairn_map.commits.commit import META_BYTES_MAX, CommitMeta
 from cairn_map.commits.ids import INITIAL, OPERATOR
 from cairn_map.commits.mark import check_place
 from cairn_map.epochs.epoch import Epoch, begin_s, epoch_of
@@ -29,13 +29,16 @@ TIME_MAX_S = 1e11
 AGAIN_MAX_S = 3600.0
 """Longest time after which a commit from the future is tried again: the clock that is wrong may be this one."""
 
+EDIT_BYTES = 1 << 13
+"""Room in a meta for what an operator's edit says of one mark, at most 6 kB with the longest texts."""
+
 
 def check_claims(row: MapRow, caller: Caller, id_text: str, meta: CommitMeta, *, cells: int) -> None:
     """Refuse a commit by its meta alone, before its evidence is decoded.
 
     Raises:
-        BadInputError: kind `other_id`, `other_geometry`, `other_layer`, `reserved_name`, `bad_commit`, `bad_mark` or
-            `bad_place`.
+        BadInputError: kind `other_id`, `other_geometry`, `other_layer`, `reserved_name`, `bad_commit`, `bad_mark`,
+            `bad_place` or `too_large`.
         DeniedError: kind `not_allowed`: made by, or retracting from, a robot that the caller is not.
         DamagedDataError: kind `empty_commit`.
     """
@@ -59,6 +62,26 @@ def check_claims(row: MapRow, caller: Caller, id_text: str, meta: CommitMeta, *,
         if mark.by and meta.commit_id.author.robot != OPERATOR:
             said = f"the mark {mark.name!r} speaks for {mark.by!r}; a robot marks in its own name, without `by`"
             raise BadInputError("bad_mark", said)
+    _check_room(meta)
+
+
+def _check_room(meta: CommitMeta) -> None:
+    """Refuse a robot's marks that no operator could edit: his commit repeats them all, with the robot's name.
+
+    Raises:
+        BadInputError: kind `too_large`.
+    """
+    robot = meta.commit_id.author.robot
+    if not meta.marks or robot == OPERATOR:
+        return
+    names_bytes = len(meta.marks) * len(f',"by":"{robot}"')
+    size_bytes = len(meta.model_dump_json(exclude_defaults=True).encode()) + names_bytes
+    if size_bytes > META_BYTES_MAX - EDIT_BYTES:
+        raise BadInputError(
+            "too_large",
+            f"with its robot's name at each mark this commit's meta has {size_bytes} bytes, at most "
+            f"{META_BYTES_MAX - EDIT_BYTES}, so that an operator can change one of them; make several commits of it",
+        )
 
 
 def check_epoch(epoch: Epoch, epoch_s: int, *, now_s: float) -> None:
