@@ -182,7 +182,7 @@ def _millimetres(what: str, lengths_m: Iterable[float]) -> tuple[int, int, int]:
     values = [float(each) for each in lengths_m]
     if len(values) != 3 or not all(map(math.isfinite, values)):
         raise BadInputError("bad_place", f"a mark's {what} is three finite numbers in metres, got {values}")
-    x, y, z = (round(each * 1000) for each in values)
-    if max(abs(x), abs(y), abs(z)) > MILLIMETRES_MAX:
+    if max(map(abs, values)) * 1000 > MILLIMETRES_MAX:
         raise BadInputError("bad_place", f"a mark's {what} is within {MILLIMETRES_MAX / 1000:g} m, got {values}")
+    x, y, z = (round(each * 1000) for each in values)
     return x, y, z

@@ -223,6 +223,7 @@ def test_a_mark_is_made_of_metres_and_of_text_as_people_write_it() -> None:
         ({"at_m": (float("nan"), 0, 0)}, "bad_place", "finite"),
         ({"at_m": (0.0, 0.0)}, "bad_place", "three"),
         ({"at_m": (1e30, 0, 0)}, "bad_place", "within"),
+        ({"extent_m": (0, 0, 1.7e308)}, "bad_place", "within"),
         ({"extent_m": (-1, 0, 0)}, "bad_place", "0 m or more"),
         ({"name": "x" * 65}, "bad_mark", "name"),
         ({"name": "bell\x07"}, "bad_mark", "U\\+0007 at 4"),
