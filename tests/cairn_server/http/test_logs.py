@@ -130,7 +130,9 @@ def test_every_line_is_json_from_the_first_to_the_last(tmp_path: Path, request: 
         check=False,
     )
     first.send_signal(signal.SIGTERM)
-    text, _ = first.communicate(timeout=60)
+    with first.stdout as rest:
+        text = rest.read()  # not `communicate`: it would leave out what `readline` read ahead
+    first.wait(timeout=60)
     assert (first.returncode, second.returncode) == (0, 4)
     assert ADMIN not in text + second.stdout + second.stderr
     (refused,) = (json.loads(line) for line in f"{second.stdout}{second.stderr}".splitlines())
