@@ -26,6 +26,7 @@ from cairn_server.store.objects.cold_bytes import MARK, AwayError
 from cairn_server.store.postgres.connections import Connection, Connections
 from cairn_server.store.postgres.schema import BOUND_OLDEST, STEPS
 from cairn_server.store.postgres.store import PgStore
+from cairn_server.store.settling import settler
 from cairn_server.store.settling.settler import Settler
 from cairn_server.store.store_rows import CellRow, MapRow
 
@@ -292,6 +293,25 @@ def test_two_settlers_at_a_time_do_no_harm(store: ColdStore, database: Database)
     assert not named(database) & dead(database)
     for other in others:
         other.close()
+
+
+def test_cells_that_another_settler_moved_between_two_looks_are_left_out(
+    store: ColdStore, database: Database, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    row = folded_map(store, *COMMITS)
+    listed = settler._groups
+
+    def moved_meanwhile(sizes: list[tuple[int, int]], bytes_max: int) -> Iterator[list[int]]:
+        monkeypatch.setattr(settler, "_groups", listed)
+        with closing(Settler(Connections(database.url, limit=2), store.bucket, holder="other")) as other:
+            store.settle(row, other)
+        return listed(sizes, bytes_max)
+
+    monkeypatch.setattr(settler, "_groups", moved_meanwhile)
+    before = contents(store, row)
+    store.settle(row)
+    assert contents(store, row) == before
+    assert bytes_in_rows(database) == 0
 
 
 def test_one_settler_works_at_a_time(store: ColdStore, database: Database) -> None:

@@ -243,6 +243,8 @@ class Settler:
             )
             with self._connections.lent() as connection:
                 found = rows(connection, query, (row.number, keys))
+            if not found:  # another one moved them meanwhile
+                continue
             yield [
                 _Cell(key, lm, sha, body, stamps, cell_name(row.number, key, lm=lm, digest=digest))
                 for key, lm, sha, body, stamps, digest in found
