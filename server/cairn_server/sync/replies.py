@@ -22,7 +22,7 @@ from cairn_server.store.store_rows import MapRow
 from cairn_server.sync.asked_cells import Asked
 from cairn_server.sync.held_commits import WantedCommits
 from cairn_server.sync.missing import CellFrames, HeaderFacts, header_of, proven_since, query_of, reply_frames
-from cairn_server.sync.slices import SLICES_HERE, SLICES_THERE, Slices
+from cairn_server.sync.slices import SLICES_OF_DATABASE, SLICES_OF_FILE, Slices
 
 
 class StableVectors:
@@ -60,7 +60,7 @@ class MainReplies:
         self._figures = figures
         self._stable = stable
         self._cache = ReadCache(share=cache_share)
-        self._slices = Slices(SLICES_HERE if store.replicas is None else SLICES_THERE)
+        self._slices = Slices(SLICES_OF_FILE if store.replicas is None else SLICES_OF_DATABASE)
 
     def missing(self, row: MapRow, branch: str, asked: Asked) -> bytes:
         """Frames that bring the asker to the head, wholly in memory before they are sent.
@@ -69,7 +69,7 @@ class MainReplies:
         """
         # All from one snapshot (rule 3), and joined before anything is sent: a slow link must not keep a snapshot open,
         # which holds up the emptying of the store's log.
-        with self._cells.reading(row) as faults, self._store.snapshot(row) as snapshot:
+        with self._slices.turn(), self._cells.reading(row) as faults, self._store.snapshot(row) as snapshot:
             query = query_of(asked, snapshot)
             cells = CellFrames(snapshot, query, row.layer, self._cache, faults)
             frames = without_begun(reply_frames(cells, self._facts(row, snapshot)), asked.request.begun)

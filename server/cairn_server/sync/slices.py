@@ -11,14 +11,15 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from typing import TypeVar
 
 T = TypeVar("T")
 
 SLICE_S = 0.01
 """Time after which a reply lets others go on; most are made in less."""
-SLICES_HERE, SLICES_THERE = 2, 4
-"""Replies in the making at once from a store on this machine, and from a database, where they wait most of the time."""
+SLICES_OF_FILE, SLICES_OF_DATABASE = 2, 4
+"""Replies in the making at once from a file of SQLite, and from a database, where they wait most of the time."""
 
 
 class Slices:
@@ -37,18 +38,23 @@ class Slices:
         """Count of the threads that wait for a slice now."""
         return len(self._waiting)
 
-    def of(self, parts: Iterable[T]) -> Iterator[T]:
-        """The same parts, made in slices; the caller takes them without waiting between two of them."""
+    @contextmanager
+    def turn(self) -> Iterator[None]:
+        """Compute in a slice, and give it back at the end."""
         self._take()
         try:
-            end_s = self._steady_s() + SLICE_S
-            for part in parts:
-                yield part
-                if self._steady_s() >= end_s:
-                    self._let_others()
-                    end_s = self._steady_s() + SLICE_S
+            yield
         finally:
             self._give()
+
+    def of(self, parts: Iterable[T]) -> Iterator[T]:
+        """The same parts, each slice handed on when it is over; inside a `turn`, without a wait between two parts."""
+        end_s = self._steady_s() + SLICE_S
+        for part in parts:
+            yield part
+            if self._steady_s() >= end_s:
+                self._let_others()
+                end_s = self._steady_s() + SLICE_S
 
     def _take(self) -> None:
         with self._lock:

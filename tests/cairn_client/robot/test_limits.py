@@ -87,7 +87,7 @@ def row_bytes() -> int:
 def test_a_full_disk_holds_the_cells_around_the_robot_and_they_go_with_it(
     row_server: LiveServer, tmp_path: Path, mode: str
 ) -> None:
-    limits = Limits(disk_bytes_max=76_000)
+    limits = Limits(disk_bytes_max=66_000)
     with robot_in(tmp_path, row_server.map_url, limits=limits, mode=mode, stay=True) as robot:
         for place in (0, 2, SIDE):
             at(robot, place)
@@ -126,7 +126,7 @@ def test_memory_is_bounded_as_the_disk_is(row_server: LiveServer, tmp_path: Path
 
 
 def test_a_box_that_is_chosen_is_asked_for_alone(row_server: LiveServer, tmp_path: Path) -> None:
-    with robot_in(tmp_path, row_server.map_url, limits=Limits(disk_bytes_max=76_000)) as robot:
+    with robot_in(tmp_path, row_server.map_url, limits=Limits(disk_bytes_max=66_000)) as robot:
         at(robot, 0)
         robot.sync()
         before = robot.traffic.down_bytes
@@ -137,7 +137,7 @@ def test_a_box_that_is_chosen_is_asked_for_alone(row_server: LiveServer, tmp_pat
 
 def test_own_evidence_is_shown_where_the_servers_cells_had_to_go(row_server: LiveServer, tmp_path: Path) -> None:
     far = cell_key((-SIDE, 0, 0))
-    with robot_in(tmp_path, row_server.map_url, limits=Limits(disk_bytes_max=76_000)) as robot:
+    with robot_in(tmp_path, row_server.map_url, limits=Limits(disk_bytes_max=66_000)) as robot:
         robot.replica.commit({far: full_cell(99)})
         at(robot, SIDE)
         robot.replica.header = None

@@ -1,12 +1,21 @@
 """Slices of computing: never more at once than places, none waits for ever, and a short one not for a long one."""
 
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from typing import TypeVar
 
 import pytest
 from tests.fixtures.server.deadline import until
 
 from cairn_server.sync.slices import SLICE_S, Slices
+
+T = TypeVar("T")
+
+
+def taken(slices: Slices, parts: Iterable[T]) -> Iterator[T]:
+    """All parts, in slices of one turn."""
+    with slices.turn():
+        yield from slices.of(parts)
 
 
 def test_all_parts_come_in_order_and_no_more_are_made_at_once_than_places() -> None:
@@ -24,7 +33,7 @@ def test_all_parts_come_in_order_and_no_more_are_made_at_once_than_places() -> N
             yield n
 
     made: list[list[int]] = []
-    threads = [threading.Thread(target=lambda: made.append(list(slices.of(parts())))) for _ in range(8)]
+    threads = [threading.Thread(target=lambda: made.append(list(taken(slices, parts())))) for _ in range(8)]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -44,10 +53,10 @@ def test_a_short_reply_is_done_in_the_midst_of_a_long_one() -> None:
         yield "a slice later"
         yield "long ends"
 
-    thread = threading.Thread(target=lambda: order.extend(slices.of(long())))
+    thread = threading.Thread(target=lambda: order.extend(taken(slices, long())))
     thread.start()
     ticking.wait()
-    order += slices.of(["short"])
+    order += taken(slices, ["short"])
     thread.join()
     assert order == ["long begins", "a slice later", "short", "long ends"]
 
@@ -60,8 +69,8 @@ def test_an_error_gives_the_slice_back() -> None:
         raise ValueError("damaged")
 
     with pytest.raises(ValueError, match="damaged"):
-        list(slices.of(failing()))
-    assert list(slices.of([2])) == [2]
+        list(taken(slices, failing()))
+    assert list(taken(slices, [2])) == [2]
 
 
 class Ticking:
