@@ -149,7 +149,7 @@ def test_cells_and_maps_download_as_files_that_other_programs_read(
     head = (tmp_path / "map.ply").read_bytes().partition(b"end_header\n")
     count = int(re.search(rb"element vertex (\d+)", head[0]).group(1))  # type: ignore[union-attr]
     assert count > 1000
-    sizes_bytes = {b"float": 4, b"double": 8, b"uint": 4, b"uchar": 1}
+    sizes_bytes = {b"float": 4, b"double": 8, b"int": 4, b"uint": 4, b"uchar": 1}
     columns = re.findall(rb"property (\w+) (\w+)", head[0])
     assert len(head[2]) == count * sum(sizes_bytes[kind] for kind, _ in columns)
     assert {b"colour_measured_s", b"temperature_measured_s"} <= {name for _, name in columns}  # its map has epochs
