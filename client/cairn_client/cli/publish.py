@@ -64,7 +64,7 @@ def add_parser(commands: Subparsers) -> None:
     publish.add_argument("map", help="http://HOST:PORT/maps/NAME")
     publish.add_argument("--foxglove", type=_address, metavar="[HOST:]PORT", help="serve viewers here (0: a free port)")
     publish.add_argument(
-        "--origin", action="append", default=[], type=_origin, metavar="URL", help="pages of this origin may join, too"
+        "--origin", action="append", default=[], type=_origin, metavar="ORIGIN", help="its pages may join, too"
     )
     publish.add_argument("--mcap", type=Path, metavar="FILE", help="write the messages into a file")
     publish.add_argument("--follow", action="store_true", help="go on with each change; with --foxglove it does")
