@@ -30,7 +30,7 @@ from cairn_map.wire.messages import CreateMap
 pytestmark = [pytest.mark.processes, pytest.mark.slow]
 
 MAPS = ["lab", "hall"]
-DRAIN_S = 3
+DRAIN_S = 8
 """More than the proxy's look at /healthz each second, and less than the drain of compose.scale.yaml."""
 SEEN_S = 3
 """Time in which the proxy has surely seen that a new server is there, as docs/scale.md asks before the next is stopped:
