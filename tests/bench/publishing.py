@@ -11,7 +11,7 @@ import statistics
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from tests.bench.building import building_map, wait_until_folded
@@ -44,12 +44,13 @@ def publishing_rows(smoke: bool) -> Iterator[Row]:
         grid = snapshot.floor_grid(ground_m=ground_m)
         H, W = grid.values.shape
         yield "floor of the building, 4 cm", f"{W} x {H}", f"pixels, {free_m2:.0f} m2 free at {ground_m:.2f} m"
-        for what, work in (
+        works: tuple[tuple[str, Callable[[], object]], ...] = (
             ("its grid, once read", lambda: snapshot.floor_grid(ground_m=ground_m)),
             ("its storeys' grounds", snapshot.grounds),
             ("its picture for map servers", lambda: pgm_of(grid)),
-        ):
-            yield f"  {what}", f"{1e3 * wall_s(work, repeats):.1f}", "ms"  # type: ignore[arg-type]
+        )
+        for what, work in works:
+            yield f"  {what}", f"{1e3 * wall_s(work, repeats):.1f}", "ms"
         yield from _change_rows(folder, Path(name) / "server", ground_m=ground_m, changes=3 if smoke else 30)
 
 

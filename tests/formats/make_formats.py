@@ -191,7 +191,7 @@ def found_with_epochs() -> dict[str, object]:
 
 
 def found_with_marks() -> dict[str, object]:
-    """What the stored bytes of version 3 say today."""
+    """Content of the stored bytes of version 3, as it is read today."""
     commit, _ = open_commit((FOLDER / "v3.commit").read_bytes())
     return {"commit": {"sha": commit.sha.hex(), "meta": json.loads(commit.meta.model_dump_json())}}
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import httpx
 from tests.crash.lives import commit_of
+from tests.fixtures.server.deadline import until
 from tests.replicas.site import Site
 
 from cairn_map.commits.commit import Commit
@@ -34,6 +35,11 @@ class Pushed:
     silence_s: float = 0.0
     """Longest time in which no push at all was acknowledged."""
     lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def go_on(self, after: str) -> None:
+        """Return when a push was acknowledged from now on."""
+        start_s = time.monotonic()
+        until(lambda: self.last_s > start_s, f"robots go on after: {after}")
 
     def note(self, answer: str, commit: Commit | None = None) -> None:
         """Count an answer; with a commit, it was acknowledged."""

@@ -16,7 +16,7 @@ Marks = dict[MarkKey, Mark]
 
 
 def has_marks(seed: int) -> bool:
-    """Of every third seed robots and operators mark: of both kinds of history."""
+    """True for every third seed: its robots and operators mark, with epochs and without."""
     return seed % 3 == 0
 
 

@@ -158,6 +158,19 @@ def form_of(opened: KeptFolder, latest: CommitId) -> Form:
     )
 
 
+def forms_without_scans(opened: KeptFolder) -> Iterator[Form]:
+    """Newest forms of the measurements of which no scans are kept: own commits with evidence that nothing replaced."""
+    latest = opened.outbox.successors.latest
+    have = {latest(original) for original in opened.kept.commits}
+    for commit in opened.state.store.commits():
+        is_own = commit.id.author.robot == opened.robot and bool(commit.cells)
+        if not is_own or commit.id in have or latest(commit.id) != commit.id:
+            continue
+        form = form_of(opened, commit.id)
+        if form.record is not None or form.stated is None or form.rig is not None:
+            yield form
+
+
 def at_stated_place(scan: Scan, number: int, stated: CommitMeta | None) -> Scan:
     """A scan where its commit states it, as exact as a quaternion; itself if that is where it was observed.
 

@@ -16,7 +16,14 @@ from pathlib import Path
 import numpy as np
 
 from cairn_calib.rig.rig import Rig
-from cairn_client.folders.kept_folder import Form, KeptFolder, at_stated_place, form_of, kept_folder
+from cairn_client.folders.kept_folder import (
+    Form,
+    KeptFolder,
+    at_stated_place,
+    form_of,
+    forms_without_scans,
+    kept_folder,
+)
 from cairn_client.robot.amending import facts_of_measurement
 from cairn_fusion.mapping.integrate import Integrator, integrator_from_text
 from cairn_fusion.mapping.measurement import Measurement
@@ -189,22 +196,14 @@ def _check_scans(opened: KeptFolder, original: CommitId, form: Form, recipe: Rec
 
 
 def _find_lost(opened: KeptFolder, recipe: Recipe, plan: FolderPlan) -> None:
-    """Plan the measurements without scans: own commits with evidence that nothing replaced."""
-    latest = opened.outbox.successors.latest
-    have = {latest(original) for original in opened.kept.commits}
-    for commit in opened.state.store.commits():
-        if commit.id.author.robot != opened.robot or not commit.cells or commit.id in have:
-            continue
-        if latest(commit.id) != commit.id:
-            continue
-        form = form_of(opened, commit.id)
-        is_measured = form.record is not None or form.stated is None or form.rig is not None
-        if not is_measured or _is_done(form, recipe):
+    """Plan the measurements without scans that are not done yet."""
+    for form in forms_without_scans(opened):
+        if _is_done(form, recipe):
             continue
         if recipe.old_rigs and form.rig is not None and form.rig not in recipe.old_rigs:
             plan.other_rig += 1
         else:
-            plan.lost.append(commit.id)
+            plan.lost.append(form.commit)
 
 
 def _amend(opened: KeptFolder, original: CommitId, recipe: Recipe) -> None:

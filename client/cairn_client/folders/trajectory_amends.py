@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from cairn_calib.rig.poses import Transform, check_transform
 from cairn_calib.rig.rig import Rig
-from cairn_client.folders.kept_folder import Form, KeptFolder, form_of
+from cairn_client.folders.kept_folder import Form, KeptFolder, form_of, forms_without_scans
 from cairn_client.robot.amending import facts_of_measurement
 from cairn_fusion.mapping.integrate import Integrator, integrator_from_text
 from cairn_fusion.mapping.measurement import Measurement, scan_pose
@@ -273,19 +273,10 @@ def _step_m(form: Form, T_map_rig: Poses) -> float | None:
 
 
 def _find_lost(opened: KeptFolder, poses_of: PosesOf, plan: MovePlan) -> None:
-    """Plan the measurements without scans: own commits with evidence that nothing replaced, and that are elsewhere."""
-    latest = opened.outbox.successors.latest
-    have = {latest(original) for original in opened.kept.commits}
-    for commit in opened.state.store.commits():
-        if commit.id.author.robot != opened.robot or not commit.cells or commit.id in have:
-            continue
-        if latest(commit.id) != commit.id:
-            continue
-        form = form_of(opened, commit.id)
-        scans = form.stated.scans if form.stated else ()
-        is_measured = form.record is not None or form.stated is None or form.rig is not None
-        if is_measured and not _are_there(scans, poses_of):
-            plan.lost.append(commit.id)
+    """Plan the measurements without scans that are elsewhere."""
+    for form in forms_without_scans(opened):
+        if not _are_there(form.stated.scans if form.stated else (), poses_of):
+            plan.lost.append(form.commit)
 
 
 def _are_there(scans: Sequence[ScanPose], poses_of: PosesOf) -> bool:

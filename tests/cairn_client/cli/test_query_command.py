@@ -8,16 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.fixtures.client.live_server import MAP, LiveServer
 from tests.fixtures.client.made import GEOMETRY, A, opened
+from tests.fixtures.client.served_map import served_map
 
 from cairn_client.cli.maps import query
 from cairn_client.cli.maps.command import main
 from cairn_client.folders.map_folder import open_map
-from cairn_client.http.api import MapApi
-from cairn_client.replica.outbox import CommitFacts
-from cairn_client.robot.robot import Robot
-from cairn_fusion.mapping.measurement import scan_pose
 from cairn_map.codec.cell_code import encode_cell
 from cairn_map.epochs.epoch import Epoch
 from cairn_map.epochs.history_map import HistoryMap
@@ -28,7 +24,6 @@ from cairn_map.evidence.grid import cell_of_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.files.cell_folder import FolderHead, write_cell, write_head
 from cairn_map.queries.map_snapshot import snapshot_of
-from cairn_map.wire.messages import CreateMap
 
 Place = Path | str
 # Voxels of 5 cm: 0 is at the origin, 7 is the upper corner of its 2^3 block.
@@ -46,20 +41,8 @@ def evidence() -> Evidence:
 @pytest.fixture(scope="module")
 def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """The same map on a server."""
-    root = tmp_path_factory.mktemp("server")
-    server = LiveServer(root / "data")
-    try:
-        with MapApi(server.url) as api:
-            api.create_map(MAP, CreateMap(geometry=GEOMETRY))
-        # As many counts as scans.
-        scans = tuple(scan_pose(float(n), np.eye(4)) for n in range(4))
-        with Robot(None, server.map_url, directory=root / "mole", name="mole") as robot:
-            robot.replica.commit({A: evidence()}, CommitFacts(scans=scans))
-            robot.sync()
-            server.wait_for_fold()
-        yield server.map_url
-    finally:
-        server.stop()
+    with served_map(tmp_path_factory.mktemp("server"), {A: evidence()}, GEOMETRY, scans=4) as url:
+        yield url
 
 
 @pytest.fixture(params=["cells", "robot", "url"])

@@ -6,17 +6,12 @@ from itertools import product
 
 import numpy as np
 import pytest
-from tests.fixtures.client.live_server import MAP, LiveServer
+from tests.fixtures.client.served_map import served_map
 from tests.fixtures.map.made import SMALL, random_evidence
 
 from cairn_client.folders.map_folder import open_map, open_part
 from cairn_client.folders.needed_cells import along_ray, near_points
-from cairn_client.http.api import MapApi
-from cairn_client.replica.outbox import CommitFacts
-from cairn_client.robot.robot import Robot
-from cairn_fusion.mapping.measurement import scan_pose
 from cairn_map.evidence.grid import cell_key
-from cairn_map.wire.messages import CreateMap
 
 CELLS = [cell_key(cell) for cell in product((-2, -1, 0, 1), (-1, 0, 1), (-1, 0))]
 REACH_M = 2.5 * SMALL.cell_edge_m
@@ -25,21 +20,9 @@ QUESTIONS = 20
 
 @pytest.fixture(scope="module")
 def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    root = tmp_path_factory.mktemp("server")
-    server = LiveServer(root / "data")
-    try:
-        with MapApi(server.url) as api:
-            api.create_map(MAP, CreateMap(geometry=SMALL))
-        # As many counts as scans.
-        scans = tuple(scan_pose(float(n), np.eye(4)) for n in range(8))
-        cells = {key: random_evidence(n, SMALL, voxels=250) for n, key in enumerate(CELLS)}
-        with Robot(None, server.map_url, directory=root / "mole", name="mole") as robot:
-            robot.replica.commit(cells, CommitFacts(scans=scans))
-            robot.sync()
-            server.wait_for_fold()
-        yield server.map_url
-    finally:
-        server.stop()
+    cells = {key: random_evidence(n, SMALL, voxels=250) for n, key in enumerate(CELLS)}
+    with served_map(tmp_path_factory.mktemp("server"), cells, SMALL, scans=8) as url:
+        yield url
 
 
 def test_points_rays_and_nearest_voxels_have_the_answers_of_the_whole_map(url: str) -> None:

@@ -83,7 +83,10 @@ def driven(rig: Rig, tmp_path: Path) -> Iterator[Driven]:
 
 def chunks_of(seconds: float) -> Iterator[list[BagMessage]]:
     """The drive's messages in order of their stamps, so many seconds of it at a time."""
-    chunk_of = lambda message: int((message.log_ns / 1e9 - DRIVE[0][0]) / seconds)  # noqa: E731
+
+    def chunk_of(message: BagMessage) -> int:
+        return int((message.log_ns / 1e9 - DRIVE[0][0]) / seconds)
+
     for _, messages in groupby(map(bag_message, DRIVE), chunk_of):
         yield list(messages)
 

@@ -1,4 +1,4 @@
-"""What root does to a store of a service user leaves it to that user, whose server could not open it otherwise."""
+"""Commands that root runs on a store of a service user leave all files to that user, whose server opens them."""
 
 import os
 from pathlib import Path
