@@ -3,6 +3,7 @@
 There browsers give a page less than on https or loopback: no clipboard, no Web Crypto, no Brotli.
 """
 
+import re
 import socket
 import time
 from collections.abc import Iterator
@@ -56,7 +57,7 @@ def lan_room(room: Room, tmp_path: Path) -> Iterator[Room]:
     made.start()
     try:
         with made.api as api:
-            api.create_map(MAP, CreateMap(geometry=GEOMETRY))
+            api.create_map(MAP, CreateMap(geometry=GEOMETRY, epoch_s=120))
         made.measure("scout", 0)
         yield made
     finally:
@@ -78,6 +79,11 @@ def test_over_plain_http_on_a_lan_the_page_is_whole_and_tells_what_is_gone(chrom
         console.ask_middle()
         # This server keeps no commit's evidence once it is in the map.
         console.page.get_by_text("Commits before are not kept any more: of them only the sum is known.").wait_for()
+        # The scans are of October 2025, and in a map with epochs each channel says when it was measured.
+        voxel = console.page.get_by_role("region", name="Voxel").inner_text()
+        assert re.search(
+            r"temperature\s+\S+ °C ± \S+ °C \(\d+ samples?, 2025-10-09 \d\d:\d\d:\d\d UTC, \d+ d ago\)", voxel
+        )
         copy = console.page.get_by_role("region", name="Take away").get_by_role("button", name="Copy").first
         copy.click()
         console.page.get_by_role("button", name="Copied").wait_for()
