@@ -53,6 +53,7 @@ from cairn_map.wire.access_messages import (
 from cairn_map.wire.change_messages import ChangesAnswer
 from cairn_map.wire.frames import FRAME_BYTES_MAX, JSON_BYTES_MAX, Frame
 from cairn_map.wire.hottest_messages import HottestAnswer
+from cairn_map.wire.layer_messages import LAYER_FORMAT, AddLayer, LayerAdded, LayerInfo
 from cairn_map.wire.mark_messages import MarkPage, MarkReceipt, MarkRequest
 from cairn_map.wire.messages import (
     INDEX_PAGE,
@@ -88,7 +89,7 @@ if TYPE_CHECKING:
     import httpx
 
 PROTOCOL_VERSION = "1"
-FORMAT_VERSION = "2"
+FORMAT_VERSION = str(LAYER_FORMAT)
 """Newest version of cells and commits that is read; without it a server takes a client for one of version 1."""
 TIMEOUT_S, CONNECT_S = 30.0, 5.0
 NO_CONTENT, NOT_MODIFIED = 204, 304
@@ -410,6 +411,15 @@ class MapApi:
         """Add, change or remove a mark, as an operator."""
         body = self._ask("POST", f"/maps/{name}/main/marks", content=request.model_dump_json().encode())
         return message_from_json(MarkReceipt, body)
+
+    def layers(self, name: str) -> list[LayerInfo]:
+        """The layers of a map: the one that it began with, then the others by name."""
+        return list_of(LayerInfo, self._ask("GET", f"/maps/{name}/layers"))
+
+    def add_layer(self, name: str, request: AddLayer) -> LayerAdded:
+        """Add a layer to a map, as an operator; an equal one stays as it is."""
+        body = self._ask("POST", f"/maps/{name}/layers", content=request.model_dump_json().encode())
+        return message_from_json(LayerAdded, body)
 
     def vector_at(self, name: str, cursor: str) -> VersionVector:
         """The ids that a server had folded at a cursor."""

@@ -68,7 +68,7 @@ def _create(args: argparse.Namespace) -> int:
     api, name = api_of(args.map, tokens)
     if args.source is not None:
         # A grid that is asked for as well has to be the source's: evidence cannot be moved to another one.
-        asked = _Asked(args.voxel, None if args.channels is None else _channels(args.channels), args.epoch)
+        asked = _Asked(args.voxel, None if args.channels is None else channels_from_text(args.channels), args.epoch)
         with api:
             info, count, added = push_prior_data(
                 api, name, args.source, tokens=tokens, check=asked.check, epoch_s=asked.epoch_s
@@ -79,7 +79,7 @@ def _create(args: argparse.Namespace) -> int:
             say(f"{count - added} of them were pushed before, and are not added again (nor if they were retracted)")
         return 0
     with api:
-        made = api.create_map(name, CreateMap(geometry=_geometry(args), epoch_s=_epoch_s(args.epoch)))
+        made = api.create_map(name, CreateMap(geometry=_geometry(args), epoch_s=epoch_s_from_text(args.epoch)))
     say_map(made)
     return 0
 
@@ -210,7 +210,7 @@ class _Asked:
 
     def epoch_s(self, source_s: int | None) -> int | None:
         """Length of an epoch, seconds: that which was asked for, else the source's."""
-        return _epoch_s(self.epoch, otherwise=source_s)
+        return epoch_s_from_text(self.epoch, otherwise=source_s)
 
     def check(self, found: Geometry) -> None:
         """Refuse another grid than was asked for.
@@ -228,11 +228,11 @@ class _Asked:
 
 
 def _geometry(args: argparse.Namespace) -> Geometry:
-    channels = STANDARD_CHANNELS if args.channels is None else _channels(args.channels)
+    channels = STANDARD_CHANNELS if args.channels is None else channels_from_text(args.channels)
     return geometry_for(voxel_edge_m=VOXEL_M if args.voxel is None else args.voxel, channels=channels)
 
 
-def _epoch_s(text: str | None, *, otherwise: int | None = STANDARD_EPOCH_S) -> int | None:
+def epoch_s_from_text(text: str | None, *, otherwise: int | None = STANDARD_EPOCH_S) -> int | None:
     """Length of an epoch, seconds, or None for a map without.
 
     Raises:
@@ -249,7 +249,12 @@ def _epoch_s(text: str | None, *, otherwise: int | None = STANDARD_EPOCH_S) -> i
     return int(text)
 
 
-def _channels(text: str) -> tuple[Channel, ...]:
+def channels_from_text(text: str) -> tuple[Channel, ...]:
+    """Channels of a text such as `colour,dose:uSv/h:0.01`; of an empty one none.
+
+    Raises:
+        BadInputError: kind `bad_channel`.
+    """
     return tuple(map(_channel, text.split(","))) if text else ()
 
 
