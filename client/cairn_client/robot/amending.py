@@ -15,6 +15,7 @@ from cairn_calib.rig.poses import check_transform
 from cairn_client.replica.outbox import CommitFacts
 from cairn_client.replica.replica import Replica
 from cairn_client.robot.kept_scans import KeptScans
+from cairn_client.robot.map_marks import check_has_marks
 from cairn_fusion.mapping.measurement import Measurement
 from cairn_fusion.recording.scan import Scan
 from cairn_fusion.recording.scan_bytes import move_scan
@@ -95,6 +96,7 @@ class Amending:
 
     def mark(self, mark: Mark, *, instead_of: AnyCommit | None) -> Commit:
         """Commit a mark, perhaps in the place of an own one; as `Robot.mark`."""
+        check_has_marks(self._replica.state.map_name or "")
         check_place(mark, self._replica.geometry)
         commit = self._replica.mark(mark, instead_of=None if instead_of is None else commit_id_of(instead_of))
         self._on_commit(commit)
