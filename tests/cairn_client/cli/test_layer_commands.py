@@ -2,15 +2,19 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 from tests.fixtures.client.live_server import LiveServer
 from tests.fixtures.client.made import GEOMETRY, MAP, seen
 from tests.fixtures.commands import cairn
 
+from cairn_client.folders.map_folder import _layers_of, open_layers
 from cairn_client.http.api import MapApi
 from cairn_client.robot.robot import Robot
+from cairn_map.errors import NotFoundError
 from cairn_map.evidence.grid import cell_key
 from cairn_map.files.cell_folder import read_cells, read_head
+from cairn_map.queries.occupancy_states import State
 
 
 def test_a_layer_is_added_listed_and_mapped_into_drawn_and_saved(server: LiveServer, tmp_path: Path) -> None:
@@ -42,6 +46,56 @@ def test_a_layer_is_added_listed_and_mapped_into_drawn_and_saved(server: LiveSer
     cairn("map", "create", f"{server.url}/maps/copy", "--from", url, folder=tmp_path)
     with MapApi(server.url) as api:
         assert (api.map_info("copy").geometry, api.map_info("copy").name) == (fine.geometry, "copy")
+
+
+def test_points_are_read_in_the_finest_layer_that_knows_them(server: LiveServer, tmp_path: Path) -> None:
+    cairn("map", "layer", "add", server.map_url, "fine", "--voxel", "0.01", folder=tmp_path)
+    for name, url, places in (("far", server.map_url, (0, 9, 300)), ("near", f"{server.map_url}.fine", (1, 2, 70))):
+        with Robot(None, url, directory=tmp_path / name, name=name) as robot:
+            robot.replica.commit({cell_key((0, 0, 0)): seen(*places)})
+            robot.sync(until_folded=True)
+    layers = open_layers(server.map_url)
+    assert layers.names == ("fine", "evidence")
+    fine, coarse = (layers[name].voxels_in().centres_m for name in layers.names)
+    points = [*fine.tolist(), *coarse.tolist(), [50.0, 50.0, 50.0]]
+
+    def asked(url: str, *options: str) -> list[dict[str, Any]]:
+        texts = [",".join(map(str, point)) for point in points]
+        found: list[dict[str, Any]] = json.loads(
+            cairn("map", "query", url, "points", *texts, "--json", *options, folder=tmp_path)
+        )
+        return found
+
+    found = asked(server.map_url)
+    assert [each["point_m"] for each in found] == points
+    assert [each["layer"] for each in found] == [name or "evidence" for name in layers.names_at(points)]
+    assert {each["layer"] for each in found[:3]} == {"fine"}
+    assert (found[5]["layer"], found[5]["state"] != "unknown", found[-1]["state"]) == ("evidence", True, "unknown")
+    said = cairn("map", "query", server.map_url, "points", "0.005,0.005,0.005", "9,9,9", folder=tmp_path)
+    assert "layer evidence, voxels of 0.05 m:" in said
+    # One layer alone: by its name, or by its URL.
+    for name in layers.names:
+        url = server.map_url if name == "evidence" else f"{server.map_url}.{name}"
+        alone = asked(server.map_url, "--layer", name)
+        assert "layer" not in alone[0]
+        assert [each["state"] for each in alone] == [
+            State(state).name.lower() for state in layers[name].state_at(points)
+        ]
+        assert name == "evidence" or asked(url) == alone
+    assert "no layer 'far'" in cairn(
+        *("map", "query", server.map_url, "points", "0,0,0", "--layer", "far"), folder=tmp_path, code=3
+    )
+    assert "take the map's own URL" in cairn(
+        *("map", "query", f"{server.map_url}.fine", "points", "0,0,0", "--layer", "far"), folder=tmp_path, code=1
+    )
+
+
+def test_a_server_of_before_has_maps_of_one_layer() -> None:
+    class Before:
+        def layers(self, name: str) -> None:
+            raise NotFoundError("no_route", "Not Found")
+
+    assert _layers_of(Before(), "lab") == {"evidence": "lab"}  # type: ignore[arg-type]
 
 
 def test_what_is_no_layer_is_refused_with_the_next_step(server: LiveServer, tmp_path: Path) -> None:

@@ -112,7 +112,7 @@ def _run(args: argparse.Namespace) -> int:
     elif is_server and answer is _points and map_of_layer(split_map_url(args.map)[1]) is None:
         found, lines = _points_of_layers(args)
     elif answer is _points and args.layer is not None:
-        raise BadInputError("bad_option", f"--layer names a layer of a server's map, and {args.map} is none")
+        raise BadInputError("bad_option", f"{args.map} has one layer: for --layer take the map's own URL")
     else:
         found, lines = answer(_opened(args) if is_server else open_map(args.map, at_s=seconds_of(args.at)), args)
     for line in [json.dumps(found)] if args.json else lines:
