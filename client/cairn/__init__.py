@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from cairn_map.evidence.grid import Geometry, geometry_for
     from cairn_map.evidence.inverse_sensor_model import SensorModel
     from cairn_map.queries.map_snapshot import MapSnapshot
+    from cairn_map.queries.mark_groups import MarkGroup, group_marks
     from cairn_map.queries.occupancy_states import State
 
     __version__: str
@@ -63,6 +64,7 @@ __all__ = [
     "LinkBack",
     "LinkLost",
     "MapSnapshot",
+    "MarkGroup",
     "NotFoundError",
     "OutboxNearlyFull",
     "Profile",
@@ -78,6 +80,7 @@ __all__ = [
     "SyncFailed",
     "UnreachableError",
     "geometry_for",
+    "group_marks",
     "kelvin_from_celsius",
     "load_rig",
     "open_map",
@@ -103,6 +106,7 @@ _MODULES = {
     "cairn_map.evidence.grid": "Geometry geometry_for",
     "cairn_map.evidence.inverse_sensor_model": "SensorModel",
     "cairn_map.queries.map_snapshot": "MapSnapshot",
+    "cairn_map.queries.mark_groups": "MarkGroup group_marks",
     "cairn_map.queries.occupancy_states": "State",
 }
 """Names by the module that defines them; the same as the imports above, which only type checkers read."""
