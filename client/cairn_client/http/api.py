@@ -31,6 +31,7 @@ from cairn_client.sync.responses import (
     list_of,
     narrower,
 )
+from cairn_map.commits.attachment import Attachment
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.cursor import cursor_from_text
 from cairn_map.commits.ids import Author, CommitId
@@ -54,7 +55,7 @@ from cairn_map.wire.change_messages import ChangesAnswer
 from cairn_map.wire.frames import FRAME_BYTES_MAX, JSON_BYTES_MAX, Frame
 from cairn_map.wire.hottest_messages import HottestAnswer
 from cairn_map.wire.layer_messages import LAYER_FORMAT, AddLayer, LayerAdded, LayerInfo
-from cairn_map.wire.mark_messages import MarkPage, MarkReceipt, MarkRequest
+from cairn_map.wire.mark_messages import AttachmentState, MarkPage, MarkReceipt, MarkRequest, WantedAttachments
 from cairn_map.wire.messages import (
     INDEX_PAGE,
     BranchInfo,
@@ -420,6 +421,21 @@ class MapApi:
         """Add a layer to a map, as an operator; an equal one stays as it is."""
         body = self._ask("POST", f"/maps/{name}/layers", content=request.model_dump_json().encode())
         return message_from_json(LayerAdded, body)
+
+    def wanted_attachments(self, name: str, *, robot: str | None = None) -> WantedAttachments:
+        """Attachments of marks that the server lacks: all, or those that a robot may have."""
+        params = {} if robot is None else {"robot": robot}
+        return message_from_json(WantedAttachments, self._ask("GET", f"/maps/{name}/main/attachments", params=params))
+
+    def attachment(self, name: str, sha256: str) -> bytes:
+        """Bytes of an attachment; `attachment_copy` compares their SHA-256."""
+        return self._ask("GET", f"/maps/{name}/main/attachments/{sha256}")
+
+    def put_attachment_part(self, name: str, attached: Attachment, data: bytes, *, offset: int) -> AttachmentState:
+        """Send a part of an attachment."""
+        path, params = f"/maps/{name}/main/attachments/{attached.sha256}", {"total": f"{attached.size_bytes}"}
+        body = self._ask("PATCH", path, content=data, params=params | {"offset": f"{offset}"})
+        return message_from_json(AttachmentState, body)
 
     def vector_at(self, name: str, cursor: str) -> VersionVector:
         """The ids that a server had folded at a cursor."""

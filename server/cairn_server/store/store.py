@@ -22,6 +22,7 @@ from cairn_map.wire.access_messages import AuditEntry
 from cairn_map.wire.messages import LogEntry
 from cairn_server.map_refusals import GoneMap
 from cairn_server.store.admission import OWN_WORD, Grounds, RobotKey
+from cairn_server.store.attachments.attachments import Attachments
 from cairn_server.store.replica_notes import ReplicaNotes
 from cairn_server.store.store_age import StoreAge
 from cairn_server.store.store_clock import StoreClock
@@ -405,6 +406,11 @@ class Store(Protocol):
     @property
     def shares(self) -> Shares:
         """Accounts of robots."""
+        ...
+
+    @property
+    def attachments(self) -> Attachments:
+        """Attachments of marks."""
         ...
 
     @property
