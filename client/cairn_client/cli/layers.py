@@ -19,8 +19,18 @@ import json
 
 from pydantic import ValidationError
 
-from cairn_client.cli.arguments import Subparsers, add_map_parser, api_of, say, shown_bytes, shown_length
-from cairn_client.cli.maps.create import EPOCH_HELP, NO_EPOCHS, channels_from_text, epoch_s_from_text
+from cairn_client.cli.arguments import (
+    EPOCH_HELP,
+    NO_EPOCHS,
+    Subparsers,
+    add_map_parser,
+    api_of,
+    channels_from_text,
+    epoch_s_from_text,
+    say,
+    shown_bytes,
+    shown_length,
+)
 from cairn_map.errors import BadInputError, first_error
 from cairn_map.evidence.grid import geometry_for
 from cairn_map.wire.layer_messages import AddLayer, LayerInfo

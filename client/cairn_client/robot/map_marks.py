@@ -39,8 +39,10 @@ def follow_marks(api: MapApi, copy: MarkCopy, map_name: str) -> None:
     """Bring the copy of a map's marks to the map's present state.
 
     Raises:
+        BadInputError: kind `layer_of_map`: it is a layer.
         CairnError: the server refuses, or there is no link; what came before stays.
     """
+    check_has_marks(map_name)
     for page in islice(mark_pages(api, map_name, after=copy.cursor), PAGES_MAX):
         copy.take(page)
 

@@ -33,7 +33,7 @@ from cairn_client.robot.alignment import STEP_M, STEP_RAD, align_points, points_
 from cairn_client.robot.alignment_verdict import Alignment
 from cairn_client.robot.amending import Amending, AnyCommit, facts_of_measurement
 from cairn_client.robot.kept_scans import KeptScans
-from cairn_client.robot.map_marks import check_has_marks, seen_marks
+from cairn_client.robot.map_marks import seen_marks
 from cairn_client.robot.membership import Membership, bind_token, check_kinds
 from cairn_client.robot.replica_opening import open_replica
 from cairn_client.robot.robot_events import SIZE, Committed, Events, EventStream
@@ -476,24 +476,17 @@ class Robot:
             instead_of: commit of an own mark that it takes the place of; `retract` takes one out.
 
         Raises:
-            BadInputError: kind `bad_mark`, `bad_place`, `bad_attachment`, or `not_own`: another's, for an operator; or
-                `layer_of_map`: this robot maps into a layer, and marks are the map's.
+            BadInputError: kind `bad_mark`, `bad_place`, `bad_attachment`, `layer_of_map`; `not_own`: another's mark.
             CairnError: kind `no_mark` or `taken_back`: of `instead_of`; `store_failed`, `outbox_full`; or the server's.
         """
-        check_has_marks(self._map_name)
         time_s = self._clock.best_s()  # the server's, if it was learnt
         mark = make_mark(kind=kind, name=name, at_m=at_m, extent_m=extent_m, note=note, time_s=time_s)
         with self._lock:  # durable, and pushed with the next round
             return self._amending().mark(mark, instead_of=instead_of, attachment=attachment)
 
     def marks(self, box_m: Sequence[float] | None = None) -> list[MarkEntry]:
-        """Marks of the map at the last round, all or in a box (metres), and own ones; the first call takes a link.
-
-        Raises:
-            BadInputError: kind `bad_box`; or `layer_of_map`: this robot maps into a layer, and marks are the map's.
-        """
+        """Marks of the map at the last round, all or in a box (metres), and own ones; the first call takes a link."""
         self._check_open()
-        check_has_marks(self._map_name)
         self._rounds.begin_marks()  # each round follows them from here on
         return seen_marks(self._replica, box_m)
 
