@@ -455,10 +455,7 @@ class Store(Protocol):
     def delete_map(self, row: MapRow, *, by: str) -> GoneMap:
         """Take a map and its layers out of the store for good, and end their tokens; durable on return.
 
-        Their rows go later (`clear_deleted`). Whatever is asked of it from here on is refused as `map_gone` says.
-
-        Raises:
-            NotFoundError: kind `gone`.
+        Rows go later (`clear_deleted`). All that is asked of it later is `map_gone`; NotFoundError `gone`: it was gone.
         """
         ...
 

@@ -403,9 +403,7 @@ CREATE TABLE mark (
 CREATE INDEX mark_changed ON mark (map, changed_seq, low_x, low_y, low_z, high_x, high_y, high_z);
 ALTER TABLE author ADD COLUMN marks bigint NOT NULL DEFAULT 0;          -- of its commits, that are not taken out
 """
-LAYERS = """
-COMMENT ON COLUMN map.name IS 'of a map, or MAP.LAYER: of a further layer of one';
-"""
+LAYERS = "COMMENT ON COLUMN map.name IS 'of a map, or MAP.LAYER: of a further layer of one'"
 LAYERS_OLDEST = 11
 """Oldest step whose programs work on a store with maps of several layers: others take the commit that defines one for
 damaged, and its name for none of a map."""
