@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     from cairn_map.evidence.inverse_sensor_model import SensorModel
     from cairn_map.queries.layered_snapshot import LayeredSnapshot
     from cairn_map.queries.map_snapshot import MapSnapshot
+    from cairn_map.queries.mark_groups import MarkGroup, group_marks
     from cairn_map.queries.occupancy_states import State
 
     __version__: str
@@ -67,6 +68,7 @@ __all__ = [
     "LinkBack",
     "LinkLost",
     "MapSnapshot",
+    "MarkGroup",
     "NotFoundError",
     "OutboxNearlyFull",
     "Profile",
@@ -82,6 +84,7 @@ __all__ = [
     "SyncFailed",
     "UnreachableError",
     "geometry_for",
+    "group_marks",
     "kelvin_from_celsius",
     "load_rig",
     "open_layers",
@@ -110,6 +113,7 @@ _MODULES = {
     "cairn_map.evidence.inverse_sensor_model": "SensorModel",
     "cairn_map.queries.layered_snapshot": "LayeredSnapshot",
     "cairn_map.queries.map_snapshot": "MapSnapshot",
+    "cairn_map.queries.mark_groups": "MarkGroup group_marks",
     "cairn_map.queries.occupancy_states": "State",
 }
 """Names by the module that defines them; the same as the imports above, which only type checkers read."""

@@ -55,6 +55,7 @@ from cairn_server.store.row_spool import remove_spools
 from cairn_server.store.store import Store
 from cairn_server.store.store_rows import MapRow, UsedPart
 from cairn_server.sync.admissions import Admissions
+from cairn_server.sync.attachment_transfer import AttachmentTransfer
 from cairn_server.sync.clock_trust import ClockTrust
 from cairn_server.sync.handing_over import UpstreamProgress
 from cairn_server.sync.held_commits import HeldCommits, WantedCommits
@@ -88,6 +89,7 @@ class SyncParts:
     retracts: Retracts
     marking: Marking
     layers: MapLayers
+    attachments: AttachmentTransfer
     replies: MainReplies
     held: HeldCommits
     upstream: UpstreamProgress
@@ -189,6 +191,7 @@ class Service:
             Retracts(store, commits, wanted, on_new=on_new),
             Marking(store, commits, on_new=on_new),
             MapLayers(store, commits, settings.memory, info=self.maps.info, on_new=on_new),
+            AttachmentTransfer(store.attachments),
             MainReplies(
                 store,
                 self.cells,

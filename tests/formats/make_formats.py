@@ -15,6 +15,7 @@ from tests.naive.evidence import interleave
 
 from cairn_map.codec.cell_code import Profile, decode_cell, encode_cell
 from cairn_map.codec.history_code import decode_history, encode_history
+from cairn_map.commits.attachment import attachment_of
 from cairn_map.commits.commit import CommitMeta, ScanPose, make_commit
 from cairn_map.commits.commit_reading import open_commit
 from cairn_map.commits.cursor import Cursor
@@ -125,6 +126,15 @@ def layer_commit_bytes() -> bytes:
     return make_commit(meta, {}, GEOMETRY).data
 
 
+def attachment_commit_bytes() -> bytes:
+    """A commit with a mark that names an attachment."""
+    lamp = make_mark(
+        kind="hot_spot", name="lamp", at_m=(1.25, -2.0, 0.4), time_s=1.5e9, attachment=attachment_of(b"a picture")
+    )
+    meta = CommitMeta(id=f"{AUTHOR}.10", geometry=GEOMETRY.digest().hex(), marks=(lamp,))
+    return make_commit(meta, {}, GEOMETRY).data
+
+
 def cursor(seq: int) -> Cursor:
     """A made-up place in a made-up log."""
     return Cursor(bytes(range(16)), seq, bytes(range(16, 32)))
@@ -164,6 +174,7 @@ def made() -> dict[str, bytes]:
         "v2.commit": epoch_commit_bytes(),
         "v3.commit": mark_commit_bytes(),
         "v4.commit": layer_commit_bytes(),
+        "v3-attachment.commit": attachment_commit_bytes(),
     }
 
 
@@ -208,6 +219,13 @@ def found_with_epochs() -> dict[str, object]:
 def found_with_marks() -> dict[str, object]:
     """Content of the stored bytes of version 3, as it is read today."""
     commit, _ = open_commit((FOLDER / "v3.commit").read_bytes())
+    meta = commit.meta.model_dump_json(exclude={"layer": True, "marks": {"__all__": {"attachment"}}})  # later fields
+    return {"commit": {"sha": commit.sha.hex(), "meta": json.loads(meta)}}
+
+
+def found_with_attachments() -> dict[str, object]:
+    """Content of the stored bytes of version 3 with an attachment, as it is read today."""
+    commit, _ = open_commit((FOLDER / "v3-attachment.commit").read_bytes())
     return {"commit": {"sha": commit.sha.hex(), "meta": json.loads(commit.meta.model_dump_json(exclude={"layer"}))}}
 
 
@@ -230,6 +248,10 @@ def main() -> None:
         (FOLDER / "v3.json").write_text(json.dumps(found_with_marks(), indent=1, sort_keys=True) + "\n")
     if not (FOLDER / "v4.json").exists():
         (FOLDER / "v4.json").write_text(json.dumps(found_with_layer(), indent=1, sort_keys=True) + "\n")
+    if not (FOLDER / "v3-attachment.json").exists():
+        (FOLDER / "v3-attachment.json").write_text(
+            json.dumps(found_with_attachments(), indent=1, sort_keys=True) + "\n"
+        )
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 
 from tests.memory_store.admission import Keys, admit_registration
+from tests.memory_store.attachments import MemoryAttachments
 from tests.memory_store.clock import MemoryClock
 from tests.memory_store.figures import MemoryHealth, MemoryNotes, MemoryShares, MemoryUses
 from tests.memory_store.leases import MemoryLeases
@@ -57,6 +58,7 @@ class MemoryStore:
         self.health = MemoryHealth(self._maps, self.age)
         self.uses = MemoryUses(self._maps)
         self.shares = MemoryShares(self._maps)
+        self.attachments = MemoryAttachments(self._maps)
         self.notes = MemoryNotes(self._maps)
 
     def create_map(

@@ -9,11 +9,13 @@ from contextlib import contextmanager
 from importlib.metadata import entry_points
 from typing import Protocol
 
+from cairn_map.commits.attachment import Attachment
 from cairn_map.commits.ids import CommitId, map_of_layer
 from cairn_map.epochs.layer import LayerDefinition
 from cairn_map.errors import BadInputError, CairnError, ConflictError, NotFoundError
+from cairn_map.wire.mark_messages import PAGE_MAX
 from cairn_map.wire.messages import CreateMap, MapInfo
-from cairn_map.wire.relay_peer import TOO_MANY_MAPS, Held, MapEnd, OwnServer, SignedCommit
+from cairn_map.wire.relay_peer import TOO_MANY_MAPS, AttachmentEnd, Held, OwnServer, SignedCommit
 from cairn_server.access.auth import UPSTREAM
 from cairn_server.map_refusals import check_same_layer
 from cairn_server.service import Service
@@ -21,6 +23,8 @@ from cairn_server.store.store_rows import MapRow
 from cairn_server.sync.handing_over import found_commit
 
 GROUP = "cairn.upstream"
+PART_BYTES = 1 << 20
+"""Bytes of an attachment that are kept in one transaction."""
 
 
 class Relay(Protocol):
@@ -64,7 +68,7 @@ def joined(service: Service) -> Iterator[Relay | None]:
 
 
 class OwnEnd:
-    """One map of this server, as a relay's `MapEnd`."""
+    """One map of this server, as a relay's `AttachmentEnd`."""
 
     def __init__(self, service: Service, row: MapRow) -> None:
         self._service = service
@@ -88,6 +92,38 @@ class OwnEnd:
             pushes.note_conflict(self._row, UPSTREAM, exc)
             raise
 
+    def has_attachments(self) -> bool:
+        """True if any are whole here."""
+        return bool(self._service.store.attachments.whole(self._row.number))
+
+    def wanted_attachments(self) -> list[Attachment]:
+        """Attachments that marks of the map name and that are not whole here."""
+        return self._service.sync.attachments.wanted(self._row, robot=None, limit=PAGE_MAX).wanted
+
+    def attachment(self, attachment: Attachment) -> bytes | None:
+        """Bytes of an attachment; None if they are not here."""
+        try:
+            return self._service.sync.attachments.data(self._row, attachment.sha256)
+        except NotFoundError:
+            return None
+
+    def keep_attachment(self, attachment: Attachment, data: bytes) -> None:
+        """Keep an attachment, whole."""
+        transfer, begin = self._service.sync.attachments, 0
+        # What the upstream began to send before a kill goes on from there.
+        for _ in range(2 * (len(data) // PART_BYTES + 2)):
+            state = transfer.add(
+                self._row,
+                UPSTREAM,
+                attachment.sha256,
+                total_bytes=len(data),
+                begin_bytes=begin,
+                data=data[begin : begin + PART_BYTES],
+            )
+            if state.is_whole:
+                return
+            begin = state.held_bytes
+
 
 class OwnMaps:
     """All maps of this server, as a relay's `OwnServer`."""
@@ -99,7 +135,7 @@ class OwnMaps:
         """Names of the maps."""
         return [row.name for row in self._service.store.maps()]
 
-    def open(self, upstream: MapInfo) -> MapEnd:
+    def open(self, upstream: MapInfo) -> AttachmentEnd:
         """The map of the same name as one of the upstream, created if it is not there.
 
         Raises:

@@ -22,6 +22,7 @@ from cairn_map.wire.access_messages import AuditEntry
 from cairn_map.wire.messages import LogEntry
 from cairn_server.map_refusals import GoneMap
 from cairn_server.store.admission import OWN_WORD, Grounds, RobotKey
+from cairn_server.store.attachments.attachments import Attachments
 from cairn_server.store.replica_notes import ReplicaNotes
 from cairn_server.store.store_age import StoreAge
 from cairn_server.store.store_clock import StoreClock
@@ -408,6 +409,11 @@ class Store(Protocol):
         ...
 
     @property
+    def attachments(self) -> Attachments:
+        """Attachments of marks."""
+        ...
+
+    @property
     def leases(self) -> FoldLeases | None:
         """Claims of maps, if several processes may fold this store; None: one process has it."""
         ...
@@ -449,10 +455,7 @@ class Store(Protocol):
     def delete_map(self, row: MapRow, *, by: str) -> GoneMap:
         """Take a map and its layers out of the store for good, and end their tokens; durable on return.
 
-        Their rows go later (`clear_deleted`). Whatever is asked of it from here on is refused as `map_gone` says.
-
-        Raises:
-            NotFoundError: kind `gone`.
+        Rows go later (`clear_deleted`). All that is asked of it later is `map_gone`; NotFoundError `gone`: it was gone.
         """
         ...
 

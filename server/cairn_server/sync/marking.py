@@ -130,6 +130,7 @@ def _mark_of(text: MarkText, row: MapRow, *, by: str) -> Mark:
         note=text.note,
         time_s=time.time(),
         by=by,
+        attachment=text.attachment,
     )
     check_place(mark, row.geometry)
     return mark

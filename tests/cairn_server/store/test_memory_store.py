@@ -10,6 +10,7 @@ from tests.fixtures.server.access import ADMIN, ENROLLER, bearer, robot_token
 from tests.fixtures.server.access_contract import AccessContract
 from tests.fixtures.server.admission_contract import AdmissionContract
 from tests.fixtures.server.answers import kind_of
+from tests.fixtures.server.attachment_contract import AttachmentContract
 from tests.fixtures.server.branch_contract import BranchContract
 from tests.fixtures.server.commit_contract import CommitContract
 from tests.fixtures.server.crowd_contract import CrowdContract
@@ -55,6 +56,7 @@ class TestMemoryStore(
     EpochContract,
     MarkContract,
     LayerContract,
+    AttachmentContract,
     BranchContract,
     AccessContract,
     AdmissionContract,

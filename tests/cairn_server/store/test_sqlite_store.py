@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from tests.fixtures.map.made import SMALL
 from tests.fixtures.server.access_contract import AccessContract
 from tests.fixtures.server.admission_contract import AdmissionContract
+from tests.fixtures.server.attachment_contract import AttachmentContract
 from tests.fixtures.server.branch_contract import BranchContract, branch, token
 from tests.fixtures.server.commit_contract import CommitContract
 from tests.fixtures.server.crowd_contract import CrowdContract
@@ -75,6 +76,7 @@ class TestSqliteStore(
     EpochContract,
     MarkContract,
     LayerContract,
+    AttachmentContract,
     BranchContract,
     AccessContract,
     AdmissionContract,

@@ -22,11 +22,18 @@ from cairn_server.map_refusals import check_layer_count, check_same_layer
 from cairn_server.store.postgres.connections import Connection, Connections, first, rows
 from cairn_server.store.postgres.retention import check_kept, count_kept, is_retracted, remember_evidence
 from cairn_server.store.postgres.robot_keys import admit_commit
-from cairn_server.store.postgres.schema import EPOCHS_OLDEST, LAYERS_OLDEST, MARKS_OLDEST, NOW_S, bar_older_programs
+from cairn_server.store.postgres.schema import (
+    ATTACHMENTS_OLDEST,
+    EPOCHS_OLDEST,
+    LAYERS_OLDEST,
+    MARKS_OLDEST,
+    NOW_S,
+    bar_older_programs,
+)
 from cairn_server.store.postgres.shares import CHARGE, COUNT_MARKS, charge_of, check_charge, lock_head, note_number
 from cairn_server.store.shares import check_marks, own_targets
 from cairn_server.store.store_rows import MapRow, NewCommit
-from cairn_server.store.stored_columns import CORNERS, epoch_to_column
+from cairn_server.store.stored_columns import CORNERS, attached_columns, epoch_to_column
 
 NUMBER_BITS = 52
 """Bits of a map's number: exact in any program that reads numbers as floats."""
@@ -69,10 +76,10 @@ SELECT count(*) FROM unnest(%(incarnations)s::text[], %(numbers)s::bigint[]) AS 
 WHERE record IS NOT NULL"""
 """SQL that counts the marks of a robot's commits that are not taken out."""
 INSERT_MARKS = (
-    f"INSERT INTO mark (map, commit_number, n, {', '.join(CORNERS)}, record)"
+    f"INSERT INTO mark (map, commit_number, n, {', '.join(CORNERS)}, record, attached_sha, attached_bytes)"
     " SELECT %(map)s, %(number)s, u.* FROM unnest(%(n)s::bigint[], "
     + ", ".join(f"%({corner})s::bigint[]" for corner in CORNERS)
-    + ", %(record)s::text[]) AS u"
+    + ", %(record)s::text[], %(attached_sha)s::bytea[], %(attached_bytes)s::bigint[]) AS u"
 )
 
 
@@ -117,6 +124,10 @@ def append_slowly(connection: Connection, row: MapRow, commit: NewCommit, *, age
     _insert_diff(connection, row, number, commit)
     if commit.marks:
         bar_older_programs(connection, MARKS_OLDEST, what="marks", instead="push no marks")
+        if any(mark.attachment for mark in commit.marks):
+            bar_older_programs(
+                connection, ATTACHMENTS_OLDEST, what="attachments of marks", instead="push marks without them"
+            )
         _insert_marks(connection, row, number, commit)
     if commit.layer is not None:
         bar_older_programs(connection, LAYERS_OLDEST, what="layers", instead="add no layer")
@@ -253,12 +264,15 @@ def _insert_marks(connection: Connection, row: MapRow, number: int, commit: NewC
         "numbers": [target.n for target in targets],
     }
     check_marks(commit, held - (first(connection, HELD_OF, values) if targets else 0))
+    shas, sizes = zip(*map(attached_columns, commit.marks), strict=True)
     corners = zip(*((*mark.low_mm, *mark.high_mm) for mark in commit.marks), strict=True)
     values = {
         "map": row.number,
         "number": number,
         "n": list(range(len(commit.marks))),
         "record": [mark.to_json() for mark in commit.marks],
+        "attached_sha": list(shas),
+        "attached_bytes": list(sizes),
         **{name: list(column) for name, column in zip(CORNERS, corners, strict=True)},
     }
     connection.execute(INSERT_MARKS.encode(), values)

@@ -148,6 +148,8 @@ LATER = {
     "commits": "robot, incarnation, n",
     "tile": "layer, tile",
     "mark": "commit_number, n",
+    "attachment": "sha, uploader",
+    "attachment_part": "sha, uploader, begin_bytes",
     "held": "account, region",
     "retracted": "id",
     "vector_mark": "seq",

@@ -3,10 +3,11 @@
 import logging
 import secrets
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from functools import partial
+from typing import Any, TypeVar
 
 from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.ids import Author
@@ -17,10 +18,11 @@ from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.map_refusals import GoneMap, check_same_map
 from cairn_server.store.admission import OWN_WORD, Grounds
+from cairn_server.store.attachments.attachment_rows import AttachmentRows, Query
 from cairn_server.store.objects.cold_bytes import ColdReads
 from cairn_server.store.postgres.branches import PgBranches
 from cairn_server.store.postgres.connections import NOTING, Connection, Connections, first
-from cairn_server.store.postgres.failures import missing_map
+from cairn_server.store.postgres.failures import lost_map, missing_map
 from cairn_server.store.postgres.folds import PgLeases, write_fold
 from cairn_server.store.postgres.health import PgHealth, PgUses
 from cairn_server.store.postgres.pushes import append_commit, append_slowly, insert_map, next_number
@@ -35,6 +37,8 @@ from cairn_server.store.postgres.writing_threads import WritingThreads
 from cairn_server.store.store_age import CLOCKS, AgeMark, Clocks, StoreAge
 from cairn_server.store.store_clock import ClockMark, clock_mark_from_text
 from cairn_server.store.store_rows import Branch, Fold, MapRow, NewCommit
+
+T = TypeVar("T")
 
 log = logging.getLogger(__name__)
 
@@ -89,6 +93,35 @@ class PgClock:
         self._threads.note(lambda connection: connection.execute(query, values))
 
 
+class AttachmentTables:
+    """`attachment_rows.Database` of a database."""
+
+    def __init__(self, connections: Connections) -> None:
+        self._connections = connections
+
+    def run(self, job: Callable[[Query], T]) -> T:
+        """Result of a job in one transaction, which may be run again."""
+        return self._connections.run(lambda connection: job(partial(_rows_of, connection)))
+
+    @contextmanager
+    def reading(self) -> Iterator[Query]:
+        """Function for readings, for the length of a `with`."""
+        with self._connections.lent() as connection:
+            yield partial(_rows_of, connection)
+
+    def check_lives(self, query: Query, map_number: int) -> None:
+        """Lock the head of a map, which a deletion takes away first, or refuse to write to it."""
+        if not query("SELECT 1 FROM head WHERE map = ? FOR NO KEY UPDATE", (map_number,)):
+            with self._connections.lent() as connection:
+                raise lost_map(connection, map_number)
+
+
+def _rows_of(connection: Connection, statement: str, values: Sequence[Any]) -> list[tuple[Any, ...]]:
+    """Rows of a statement whose values are marked as SQLite does."""
+    cursor = connection.execute(statement.replace("?", "%s").encode(), values, binary=True)
+    return cursor.fetchall() if cursor.description else []
+
+
 class PgStore(PgReads):
     """`store.Store` in a database."""
 
@@ -124,6 +157,7 @@ class PgStore(PgReads):
         self.keys = PgAdmittedKeys(self._connections)
         self.uses = PgUses(self._connections)
         self.shares = PgShares(self._connections)
+        self.attachments = AttachmentRows(AttachmentTables(self._connections))
         self.audit_log = PgAuditLog(self._connections)
         self.health = PgHealth(
             self._connections, self._threads, self.age, objects=self._objects, size_bytes_max=size_bytes_max

@@ -30,14 +30,15 @@ from cairn_server.store.sqlite.snapshot import SqliteSnapshot
 from cairn_server.store.sqlite.tile_rows import TileWriter, mark_at, recount_tile
 from cairn_server.store.sqlite.writer import first
 from cairn_server.store.store_rows import CellRow, Fold, MapRow, NewCommit
-from cairn_server.store.stored_columns import CORNERS, epoch_to_column
+from cairn_server.store.stored_columns import CORNERS, attached_columns, epoch_to_column
 from cairn_server.store.tiles import tile_of
 
 INSERT_MAP = (
     "INSERT INTO map (number, name, geometry, sensor_model, operator, log_id, seq, chain, tops, epoch_s, seal_key)"
     " VALUES (?, ?, ?, ?, ?, ?, 0, ?, ?, ?, ?)"
 )
-INSERT_MARK = f"INSERT INTO mark (map, commit_number, n, {', '.join(CORNERS)}, record) VALUES ({', '.join('?' * 10)})"  # noqa: S608 - our own columns
+MARK_COLUMNS = ("map", "commit_number", "n", *CORNERS, "record", "attached_sha", "attached_bytes")
+INSERT_MARK = f"INSERT INTO mark ({', '.join(MARK_COLUMNS)}) VALUES ({', '.join('?' * len(MARK_COLUMNS))})"  # noqa: S608 - our own columns
 
 
 def append_commit(connection: apsw.Connection, row: MapRow, commit: NewCommit, *, age_s: float) -> bool:
@@ -235,7 +236,10 @@ def _insert_marks(connection: apsw.Connection, row: MapRow, number: int, commit:
     check_marks(commit, held - sum(_held_of(connection, row, target) for target in own_targets(commit)))
     connection.executemany(
         INSERT_MARK,
-        [(row.number, number, n, *mark.low_mm, *mark.high_mm, mark.to_json()) for n, mark in enumerate(commit.marks)],
+        [
+            (row.number, number, n, *mark.low_mm, *mark.high_mm, mark.to_json(), *attached_columns(mark))
+            for n, mark in enumerate(commit.marks)
+        ],
     )
     _count_marks(connection, row, number, len(commit.marks))
 
@@ -257,7 +261,10 @@ def _bring_marks(connection: apsw.Connection, row: MapRow, number: int, seq: int
 
 def _take_marks_out(connection: apsw.Connection, row: MapRow, number: int, seq: int) -> None:
     """Note the log entry that took the marks of a commit out, whose records go."""
-    query = "UPDATE mark SET changed_seq = ?, record = NULL WHERE map = ? AND commit_number = ? AND record IS NOT NULL"
+    query = (
+        "UPDATE mark SET changed_seq = ?, record = NULL, attached_sha = NULL"
+        " WHERE map = ? AND commit_number = ? AND record IS NOT NULL"
+    )
     connection.execute(query, (seq, row.number, number))
     if connection.changes():
         _count_marks(connection, row, number, -connection.changes())

@@ -120,6 +120,7 @@ SMALL = {
     "log": "seq",
     "tile": "tile",
     "mark": "commit_number, n",
+    "attachment": "sha, uploader",
     "held": "account, region",
     "author": "robot, incarnation",
     "retracted": "id",
@@ -185,7 +186,7 @@ def clear_part(connection: apsw.Connection, *, size_bytes_max: int) -> bool:
     if number is None:
         return False
     left_bytes = size_bytes_max
-    for clear in (_clear_commits, _clear_cells):
+    for clear in (_clear_commits, _clear_cells, _clear_attachments):
         left_bytes -= clear(connection, number, left_bytes)
         if left_bytes <= 0:
             return True
@@ -231,6 +232,18 @@ def _clear_cells(connection: apsw.Connection, number: int, left_bytes: int) -> i
             went += ROW_BYTES + int(size_bytes)
             if went >= left_bytes:
                 return went
+    return went
+
+
+def _clear_attachments(connection: apsw.Connection, number: int, left_bytes: int) -> int:
+    """Remove parts of attachments; bytes that went."""
+    went = 0
+    query = "SELECT rowid, length(body) FROM attachment_part WHERE map = ? LIMIT ?"
+    for part, size_bytes in rows(connection, query, (number, ROWS_MAX)):
+        if went >= left_bytes:
+            break
+        connection.execute("DELETE FROM attachment_part WHERE rowid = ?", (part,))
+        went += ROW_BYTES + int(size_bytes)
     return went
 
 
