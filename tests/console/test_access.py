@@ -84,7 +84,7 @@ def test_an_operator_works_by_keyboard_alone(console: Console) -> None:
     assert [each for each in reached if "<" in each] == [], "whoever has the focus is seen to have it"
     assert len(reached) >= stops
     page.locator(".host canvas").focus()
-    for key, said in (("2", "Temperature"), ("3", "Probability")):
+    for key, said in (("Shift+2", "Temperature"), ("Shift+3", "Probability")):
         page.keyboard.press(key)
         assert page.get_by_role("button", name=said, exact=True).get_attribute("aria-pressed") == "true"
     page.keyboard.press("[")
