@@ -39,7 +39,7 @@ def test_axe_finds_nothing_serious_in_any_mode_or_panel(console: Console, room: 
     console.log_in()
     console.settled()
     for key, field in enumerate(FIELDS, start=1):
-        page.keyboard.press(str(key))
+        page.keyboard.press(f"Shift+{key}")
         found += serious(console, field)
     console.ask_middle()
     page.get_by_role("region", name="Voxel").get_by_text("Who saw it").wait_for()

@@ -18,7 +18,9 @@ import csv
 import io
 import json
 import math
+import time
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +36,8 @@ from cairn_map.queries.hot_spots import VOXELS_MIN, WARM_K, Spots
 from cairn_map.wire.hot_spot_messages import SPOTS_MAX, HotSpot
 
 ZERO_CELSIUS_K = 273.15
+WAIT_S = 60.0
+"""Time for which a server is asked again that has not read all of a map yet."""
 COLUMNS = (
     "number", "celsius", "sigma", "x_m", "y_m", "z_m", "over_floor_m", "voxels", "confirmed",
     "low_x_m", "low_y_m", "low_z_m", "high_x_m", "high_y_m", "high_z_m", "commit", "captured_utc",
@@ -84,16 +88,15 @@ def _run(args: argparse.Namespace) -> int:
 def _of_server(args: argparse.Namespace) -> tuple[list[HotSpot], str | None]:
     """Spots that a server lists, and what is to be said of the list."""
     api, name = api_of(args.map, args.token)
+    ask = partial(api.hot_spots, name, min_voxels=args.min_voxels, count=args.count, box_m=args.box)
+    over_k, end_s = max(0.0, args.over + ZERO_CELSIUS_K), time.monotonic() + WAIT_S
     with api:
-        answer = api.hot_spots(
-            name,
-            over_k=max(0.0, args.over + ZERO_CELSIUS_K),
-            min_voxels=args.min_voxels,
-            count=args.count,
-            box_m=args.box,
-        )
+        answer = ask(over_k=over_k)
+        # What was read is kept: each answer goes on from the one before.
+        while not answer.complete and time.monotonic() < end_s:
+            answer = ask(over_k=over_k)
     if not answer.complete:
-        return answer.spots, "(the server's search ended at its bounds: ask again, it goes on from there)"
+        return answer.spots, "(the server has not read all of the map yet: ask again, it goes on from there)"
     if answer.total > len(answer.spots):
         return answer.spots, f"{len(answer.spots)} of {answer.total} hot spots; --count N lists more"
     return answer.spots, None
@@ -114,7 +117,7 @@ def _message(spots: Spots, n: int, geometry: Geometry) -> HotSpot:
     return HotSpot(
         voxel=tuple(spots.peaks[n].tolist()),
         point_m=tuple(np.round(centres_of_voxels(spots.peaks[n], geometry), 6).tolist()),
-        kelvin=kelvin,
+        kelvin=round(kelvin, 3),
         celsius=round(kelvin - ZERO_CELSIUS_K, 2),
         sigma=round(float(spots.sigma[n]), 4),
         weight=int(spots.weight[n]),

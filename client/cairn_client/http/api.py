@@ -404,7 +404,7 @@ class MapApi:
     def hot_spots(
         self, name: str, *, over_k: float, min_voxels: int, count: int, box_m: Sequence[float] | None = None
     ) -> HotSpotsAnswer:
-        """The first `count` hot spots of a map; a box, x0, y0, z0, x1, y1, z1 in metres, has their hottest voxels."""
+        """The first `count` hot spots of a map, or of a box in metres; asked again until it is `complete`."""
         params = {"over_k": repr(over_k), "min_voxels": str(min_voxels), "count": str(count)}
         params |= {"box": ",".join(map(str, box_m))} if box_m else {}
         return message_from_json(HotSpotsAnswer, self._ask("GET", f"/maps/{name}/main/hotspots", params=params))

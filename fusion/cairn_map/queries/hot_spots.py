@@ -22,7 +22,7 @@ from cairn_map.errors import BadInputError
 from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CELL_LIMIT, Cell, CellKey, Geometry, cell_of_key, centres_of_voxels, voxels_in_cell
-from cairn_map.evidence.inverse_sensor_model import SensorModel
+from cairn_map.evidence.inverse_sensor_model import SensorModel, log_odds
 from cairn_map.evidence.voxels import reading_of_sums
 from cairn_map.queries.frozen_map import Box, FrozenMap
 from cairn_map.queries.point_queries import first_of_kind, measured_at
@@ -140,7 +140,7 @@ def pieces_of_cell(
         BadInputError: kind `unknown_channel`: the map has no temperatures.
     """
     channel = first_of_kind(geometry, ChannelKind.TEMPERATURE)
-    occupied = evidence.occupied(model)
+    occupied = _occupied(evidence, model)
     surfaces = _surfaces(key, evidence.voxels[occupied], geometry)
     sums = evidence.samples[:, geometry.planes_of(channel.name)]
     reading = reading_of_sums(channel, sums)
@@ -239,6 +239,17 @@ def over_floor_m(peak: Voxel, surfaces: Surfaces, geometry: Geometry) -> float |
         return None
     floor = first + int(np.argmax(2 * near >= near.max()))
     return max(0.0, round((last - floor - 0.5) * geometry.voxel_edge_m, 6))
+
+
+def _occupied(evidence: Evidence, model: SensorModel) -> Flags:
+    """`Evidence.occupied`, of which the many voxels that were only seen through are left out first."""
+    if model.p_occupied < 0.5:
+        return evidence.occupied(model)
+    # Only hits raise the log-odds, and those of an occupied voxel are above 0.
+    (rows,) = np.nonzero(evidence.counts[:, 0])
+    found = np.zeros(len(evidence), np.bool_)
+    found[rows] = evidence.log_odds(model, rows=rows) > log_odds(model.p_occupied)
+    return found
 
 
 def _surfaces(key: CellKey, places: Words32, geometry: Geometry) -> Int32s:

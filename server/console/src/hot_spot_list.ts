@@ -5,7 +5,9 @@ import type { HotSpot, HotSpots } from "./messages.ts";
 import { KELVIN_ZERO_C } from "./units.ts";
 
 /** Spots of an answer: 10 kB. */
-const COUNT = 40;
+const COUNT = 30;
+/** Answers that go on from the one before, while a server has not read all of the map yet. */
+const TRIES = 100;
 /** Between two questions: robots that push together make one. */
 const PAUSE_MS = 1500;
 const AGAIN_MS = 5000;
@@ -48,6 +50,7 @@ export class HotSpotList {
   }
 
   private nextMs = 0;
+  private tries = 0;
 
   private async ask(): Promise<void> {
     const { overC } = this;
@@ -60,7 +63,8 @@ export class HotSpotList {
       this.spots = found.spots;
       this.total = found.total;
       this.said = found.complete ? "" : "The server is still looking through the map.";
-      if (!found.complete) this.askAtMs = this.nextMs;
+      this.tries = found.complete ? 0 : this.tries + 1;
+      if (!found.complete && this.tries < TRIES) this.askAtMs = this.nextMs;
     } catch (error) {
       this.failed(error);
     } finally {
