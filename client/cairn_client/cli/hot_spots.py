@@ -33,7 +33,7 @@ from cairn_client.sync.responses import one_line
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.grid import Geometry, centres_of_voxels
 from cairn_map.queries.hot_spots import VOXELS_MIN, WARM_K, Spots
-from cairn_map.wire.hot_spot_messages import SPOTS_MAX, HotSpot
+from cairn_map.wire.hot_spot_messages import SPOTS_MAX, HotSpotEntry
 
 ZERO_CELSIUS_K = 273.15
 WAIT_S = 60.0
@@ -85,7 +85,7 @@ def _run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _of_server(args: argparse.Namespace) -> tuple[list[HotSpot], str | None]:
+def _of_server(args: argparse.Namespace) -> tuple[list[HotSpotEntry], str | None]:
     """Spots that a server lists, and what is to be said of the list."""
     api, name = api_of(args.map, args.token)
     ask = partial(api.hot_spots, name, min_voxels=args.min_voxels, count=args.count, box_m=args.box)
@@ -102,19 +102,19 @@ def _of_server(args: argparse.Namespace) -> tuple[list[HotSpot], str | None]:
     return answer.spots, None
 
 
-def _of_folder(args: argparse.Namespace) -> list[HotSpot]:
+def _of_folder(args: argparse.Namespace) -> list[HotSpotEntry]:
     snapshot = open_map(args.map)
     box_m = None if args.box is None else np.array(args.box).reshape(2, 3)
     found = snapshot.hot_spots(over_k=args.over + ZERO_CELSIUS_K, voxels_min=args.min_voxels, box_m=box_m)
     return [_message(found, n, snapshot.geometry) for n in range(min(args.count, len(found)))]
 
 
-def _message(spots: Spots, n: int, geometry: Geometry) -> HotSpot:
+def _message(spots: Spots, n: int, geometry: Geometry) -> HotSpotEntry:
     """A spot as a server states it, as far as a folder knows it."""
     kelvin, measured_s, (hits, misses) = float(spots.kelvin[n]), float(spots.measured_s[n]), spots.counts[n].tolist()
     corners = np.stack([spots.low[n], spots.high[n] + 1]) * geometry.voxel_edge_um / 1e6
     low_m, high_m = np.round(corners, 6).tolist()
-    return HotSpot(
+    return HotSpotEntry(
         voxel=tuple(spots.peaks[n].tolist()),
         point_m=tuple(np.round(centres_of_voxels(spots.peaks[n], geometry), 6).tolist()),
         kelvin=round(kelvin, 3),
@@ -132,7 +132,7 @@ def _message(spots: Spots, n: int, geometry: Geometry) -> HotSpot:
     )
 
 
-def line_of(number: int, spot: HotSpot) -> str:
+def line_of(number: int, spot: HotSpotEntry) -> str:
     """A spot as a line for people."""
     x, y, z = spot.point_m
     heat = f"{spot.celsius:.1f} C +- {spot.sigma:.1f}{' ' if spot.confirmed else '?'}"
@@ -144,7 +144,7 @@ def line_of(number: int, spot: HotSpot) -> str:
     return line
 
 
-def csv_of(spots: list[HotSpot]) -> str:
+def csv_of(spots: list[HotSpotEntry]) -> str:
     """Spots as a table, RFC 4180."""
     text = io.StringIO()
     table = csv.writer(text)
@@ -158,7 +158,7 @@ def csv_of(spots: list[HotSpot]) -> str:
     return text.getvalue()
 
 
-def geojson_of(spots: list[HotSpot]) -> dict[str, Any]:
+def geojson_of(spots: list[HotSpotEntry]) -> dict[str, Any]:
     """Spots as points of a GeoJSON collection, whose coordinates are metres in the map's frame."""
     features = [
         {
@@ -171,7 +171,7 @@ def geojson_of(spots: list[HotSpot]) -> dict[str, Any]:
     return {"type": "FeatureCollection", "coordinates": "metres in the map's frame, not degrees", "features": features}
 
 
-def _utc(spot: HotSpot) -> str:
+def _utc(spot: HotSpotEntry) -> str:
     """Time of the last scan of the commit that measured it, UTC; empty: unknown."""
     if spot.captured_s is None:
         return ""

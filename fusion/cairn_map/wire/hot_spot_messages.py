@@ -19,7 +19,7 @@ class _Model(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-class HotSpot(_Model):
+class HotSpotEntry(_Model):
     """Connected voxels above a threshold, with what is known of the hottest one."""
 
     voxel: Triple
@@ -65,5 +65,5 @@ class HotSpotsAnswer(_Model):
     """Cells that were read for this answer; the others were known since an earlier one."""
     total: Annotated[int, Field(ge=0)]
     """Number of the spots, of which this answer may have the first ones alone."""
-    spots: list[HotSpot]
+    spots: list[HotSpotEntry]
     """Confirmed ones first, then the others, each hottest first."""

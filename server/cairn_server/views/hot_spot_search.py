@@ -34,7 +34,7 @@ from cairn_map.queries.hot_spots import (
     ranked_spots,
 )
 from cairn_map.queries.point_queries import first_of_kind
-from cairn_map.wire.hot_spot_messages import HotSpot, HotSpotsAnswer
+from cairn_map.wire.hot_spot_messages import HotSpotEntry, HotSpotsAnswer
 from cairn_server.access.cancellation import CANCELLATION
 from cairn_server.cell_room import DECODING, voxels_of
 from cairn_server.folding.cells import CellFaults, Cells
@@ -47,7 +47,7 @@ from cairn_server.views.cell_views import style_digest
 from cairn_server.views.hottest_search import ZERO_CELSIUS_K
 from cairn_server.views.readings import stored_surface_reading
 
-SEARCH_S = 1.5
+SEARCH_S = 1.0
 """Time of one answer: it has the hottest first, and who asks again gets the rest, since what was read is kept."""
 WITNESS_S = 0.4
 """Time in an answer for who measured its spots: a diff is decoded in some 5 ms; the next answer has more of them."""
@@ -162,7 +162,7 @@ class _Search:
                 )
         return True
 
-    def described(self, spots: Spots) -> list[HotSpot]:
+    def described(self, spots: Spots) -> list[HotSpotEntry]:
         """Spots as an answer has them, with their heights over the floor and who measured them."""
         geometry = self.row.geometry
         seen, heights = self._seen(spots), self._heights(spots)
@@ -174,7 +174,7 @@ class _Search:
             hits, misses = spots.counts[n].tolist()
             kelvin, measured_s = float(spots.kelvin[n]), float(spots.measured_s[n])
             told.append(
-                HotSpot(
+                HotSpotEntry(
                     voxel=tuple(spots.peaks[n].tolist()),
                     point_m=tuple(points[n]),
                     kelvin=round(kelvin, 3),
