@@ -34,8 +34,9 @@ CHECKS_MIN_BYTES, CHECK_MAX_BYTES = 384 * MIB, 1536 * MIB
 TWO_WORKERS_BYTES = 1024 * MIB
 """Memory of all checks from which on two are made at the same time."""
 CACHES_MIN_BYTES = 64 * MIB
-CACHES_BYTES = 1200 * MIB
-"""Sum of the standard sizes of all caches: cells under change, cells read, their changes, pictures' cells and lists."""
+CACHES_BYTES = 1248 * MIB
+"""Sum of the standard sizes of all caches: cells under change, cells read, their changes, pictures' cells and lists,
+hot spots."""
 GROWING_PART = 20
 """Bodies get one part in so many of the limit."""
 LIMIT_MIN_BYTES = PROGRAMS_BYTES + CELLS_MIN_BYTES + BODIES_MIN_BYTES + CHECKS_MIN_BYTES + CACHES_MIN_BYTES

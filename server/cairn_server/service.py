@@ -68,6 +68,7 @@ from cairn_server.sync.retracting import Retracts
 from cairn_server.sync.uploads import Uploads
 from cairn_server.views.cell_views import CellViews
 from cairn_server.views.export_tickets import ExportTickets
+from cairn_server.views.hot_spot_search import HotSpotSearch
 from cairn_server.views.hottest_search import HottestSearch
 from cairn_server.views.map_changes import MapChangesSearch
 from cairn_server.views.map_exports import MapExports
@@ -105,6 +106,7 @@ class ViewParts:
     tickets: ExportTickets
     changes: MapChangesSearch
     hottest: HottestSearch
+    hot_spots: HotSpotSearch
 
 
 class Service:
@@ -214,6 +216,7 @@ class Service:
             ExportTickets(self.store, self.holders, exports),
             MapChangesSearch(self.store, self.cells),
             HottestSearch(self.store, self.cells),
+            HotSpotSearch(self.store, self.cells, cache_share=self.settings.memory.cache_share),
         )
 
     def _folded(self, row: MapRow) -> None:

@@ -26,6 +26,7 @@ from tests.bench.calibration import calibration_rows
 from tests.bench.coding import coding_rows
 from tests.bench.console import console_rows
 from tests.bench.epochs import epoch_rows
+from tests.bench.hot_spots import hot_spot_rows
 from tests.bench.imports import import_rows
 from tests.bench.integration import integration_rows
 from tests.bench.large_map import large_map_rows
@@ -284,6 +285,7 @@ PARTS: dict[str, Callable[[bool], Iterator[Row]]] = {
     "coding": coding_rows,
     "console": console_rows,
     "epochs": epoch_rows,
+    "hot_spots": hot_spot_rows,
     "imports": import_rows,
     "integration": integration_rows,
     "links": link_rows,

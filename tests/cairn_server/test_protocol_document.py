@@ -11,6 +11,7 @@ from cairn_map.commits.attachment import ATTACHMENT_BYTES_MAX
 from cairn_map.commits.commit import COMMIT_BYTES_MAX, RETRACTS_MAX
 from cairn_map.commits.mark import MARKS_MAX
 from cairn_map.files import octomap
+from cairn_map.queries import hot_spots
 from cairn_map.render import render_request
 from cairn_map.wire import live_events
 from cairn_map.wire.messages import CURSORS_MAX, JSON_FIELDS_MAX, JSON_VALUES_MAX
@@ -25,7 +26,15 @@ from cairn_server.store import numbering, shares, store_rows
 from cairn_server.store.attachments import attachments
 from cairn_server.sync import cell_changes, missing, uploads
 from cairn_server.sync.checks import check_pool, commit_checks
-from cairn_server.views import export_tickets, hottest_search, map_changes, map_exports, map_views, readings
+from cairn_server.views import (
+    export_tickets,
+    hot_spot_search,
+    hottest_search,
+    map_changes,
+    map_exports,
+    map_views,
+    readings,
+)
 
 KIND = re.compile(r"[a-z]+(_[a-z]+)*")
 RAISERS = ("_problem", "send_problem", "__init__")
@@ -99,6 +108,8 @@ def test_the_statuses_in_the_document_are_those_of_the_code(kind: str) -> None:
             hottest_search.CELLS_BYTES,
         ),
         ("looking for the hottest voxels", hottest_search.SEARCH_S),
+        ("looking for hot spots", hot_spot_search.SEARCH_S),
+        ("warm voxels at borders of cells, in a search for hot spots", hot_spots.BORDER_MAX),
         ("searches for changes at once", map_changes.SEARCHES_AT_ONCE),
         ("commits of a cell without epochs that are added up for its past", readings.PAST_ENTRIES_MAX),
         ("tickets for exports of one token", export_tickets.TICKETS_OF_TOKEN_MAX),

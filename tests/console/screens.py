@@ -32,15 +32,15 @@ def take_screens(console: Console, folder: Path, theme: str) -> list[Path]:
 
     page = console.page
     for key, field in enumerate(FIELDS, start=1):
-        page.keyboard.press(str(key))
+        page.keyboard.press(f"Shift+{key}")
         with_low_ceiling(console, lambda field=field: shoot(field))  # type: ignore[misc]
-    page.keyboard.press("2")
+    page.keyboard.press("Shift+2")
     page.get_by_label("Only").check()
     shoot("band")
     page.get_by_label("Only").uncheck()
     page.keyboard.press("x")
     shoot("hottest")
-    page.keyboard.press("1")
+    page.keyboard.press("Shift+1")
     page.keyboard.press("w")
     shoot("walk")
     console.settled()

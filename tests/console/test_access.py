@@ -39,7 +39,7 @@ def test_axe_finds_nothing_serious_in_any_mode_or_panel(console: Console, room: 
     console.log_in()
     console.settled()
     for key, field in enumerate(FIELDS, start=1):
-        page.keyboard.press(str(key))
+        page.keyboard.press(f"Shift+{key}")
         found += serious(console, field)
     console.ask_middle()
     page.get_by_role("region", name="Voxel").get_by_text("Who saw it").wait_for()
@@ -84,7 +84,7 @@ def test_an_operator_works_by_keyboard_alone(console: Console) -> None:
     assert [each for each in reached if "<" in each] == [], "whoever has the focus is seen to have it"
     assert len(reached) >= stops
     page.locator(".host canvas").focus()
-    for key, said in (("2", "Temperature"), ("3", "Probability")):
+    for key, said in (("Shift+2", "Temperature"), ("Shift+3", "Probability")):
         page.keyboard.press(key)
         assert page.get_by_role("button", name=said, exact=True).get_attribute("aria-pressed") == "true"
     page.keyboard.press("[")

@@ -33,7 +33,7 @@ SHOW_OFTEN = f"""() => {{
 
 def test_what_has_no_temperature_is_grey_and_not_cold(console: Console) -> None:
     console.page.keyboard.press("g")
-    console.page.keyboard.press("2")
+    console.page.keyboard.press("Shift+2")
     console.page.get_by_label("Ceiling").fill("120")
     console.page.locator(".host canvas").focus()
     console.page.keyboard.press("t")
@@ -59,7 +59,7 @@ def test_ages_are_told_as_time_by_the_commits_own_clocks(console: Console, room:
     for seq, age_s in told.items():
         when_s = times[max(entry for entry in times if entry <= seq)]  # a retract states no time
         assert age_s == pytest.approx(max(times.values()) - when_s)
-    console.page.keyboard.press("5")
+    console.page.keyboard.press("Shift+5")
     legend = console.page.get_by_role("region", name="Legend")
     legend.get_by_text("before the newest measurement").wait_for()
     unit = re.search(r"Age, (seconds|minutes)", legend.inner_text())
@@ -89,7 +89,7 @@ def test_the_hottest_place_is_the_servers(console: Console, room: Room) -> None:
 
 
 def test_a_probability_and_a_box_hide_the_rest_and_a_shared_link_shows_the_same(console: Console) -> None:
-    console.page.keyboard.press("1")
+    console.page.keyboard.press("Shift+1")
     console.page.keyboard.press("t")
     console.settled()
     whole = _picked(console)
@@ -105,7 +105,7 @@ def test_a_probability_and_a_box_hide_the_rest_and_a_shared_link_shows_the_same(
     assert 0 < len(part) < len(whole)
     assert (part[:, 3] >= 255 * least - 1).all()
     assert ((part[:, :3] >= low - 1e-6) & (part[:, :3] <= high + 1e-6)).all()
-    console.page.keyboard.press("2")
+    console.page.keyboard.press("Shift+2")
     address, eye = console.tell("c.address"), console.tell("c.stage.view.eye")
     console.tell("(Object.assign(c.look, { minP: 0, clip: null }), c.setField('height'))")
     console.page.keyboard.press("h")

@@ -114,7 +114,7 @@ def log_of(api: MapApi) -> list[LogEntry]:
 
 def test_who_changed_a_cell_long_ago_is_known(console: Console) -> None:
     console.until(f"c.book.known.size === {LOG} && !c.book.isReading", "the whole log is read")
-    console.page.keyboard.press("6")
+    console.page.keyboard.press("Shift+6")
     told = console.tell("[...c.cells.all.values()].map(({ key, lm }) => [key, c.book.robotAt(lm)])")
     names = {",".join(map(str, cell_of_key(key))): robot for key, robot in ((KEYS[0], "mole"), (KEYS[1], "wren"))}
     assert dict(told) == names
@@ -141,7 +141,7 @@ def test_a_log_that_ends_before_what_is_known_of_it_is_read_no_more(console: Con
 
 
 def test_what_lies_beyond_the_log_that_is_read_is_said(console: Console) -> None:
-    console.page.keyboard.press("6")
+    console.page.keyboard.press("Shift+6")
     console.tell("(c.book.isBefore = () => true, c.appearance.refreshRange(c.team.names))")
     console.page.get_by_role("region", name="Legend").get_by_text("20\u202f000 entries of the log").wait_for()
 

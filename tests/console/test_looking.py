@@ -74,7 +74,7 @@ def test_only_what_is_within_the_band_keeps_its_colour(console: Console, room: R
     page.get_by_label("Cell borders").uncheck()
     page.get_by_label("Ceiling").fill("120")
     page.locator(".host canvas").focus()
-    page.keyboard.press("2")
+    page.keyboard.press("Shift+2")
     page.keyboard.press("t")
     console.settled()
     seen = inside_of_faces(console, PLACES)

@@ -115,7 +115,7 @@ def test_another_colouring_asks_nothing_of_the_server_and_looks_otherwise(consol
     console.requests.clear()
     pictures = {}
     for key, field in enumerate(["colour", "temperature", "probability", "height", "age", "robot"], start=1):
-        console.page.keyboard.press(str(key))
+        console.page.keyboard.press(f"Shift+{key}")
         console.settled()
         pictures[field] = console.picture()
         assert console.page.locator(f'[data-field="{field}"]').get_attribute("aria-pressed") == "true"
@@ -124,7 +124,7 @@ def test_another_colouring_asks_nothing_of_the_server_and_looks_otherwise(consol
     assert [url for url in console.requests if not url.endswith(by_the_clock)] == []
     for field in ("temperature", "probability", "height", "robot"):
         assert np.abs(pictures[field].astype(int) - pictures["colour"]).mean() > 3, field
-    console.page.keyboard.press("1")
+    console.page.keyboard.press("Shift+1")
 
 
 @pytest.mark.parametrize(("slider", "way"), [("Ceiling", 1), ("Floor", -1)])

@@ -193,7 +193,7 @@ def later(route: Route) -> None:
 
 def test_what_a_retract_leaves_has_the_colour_of_who_brought_it(console: Console, crew: MapApi) -> None:
     colours = {name: (colour_of(console, name) / 255).tolist() for name in (MOLE.robot, WREN.robot)}
-    console.page.keyboard.press("6")
+    console.page.keyboard.press("Shift+6")
     commit = pushed(0, 0, MOLE, cells={KEYS[0]: surface_evidence(0, SMALL)}, scans=SCANS)
     crew.push(CREW, commit)
     console.until(f"c.book.robotAt({LAST}) === 'mole'", "mole added to the cell")

@@ -50,6 +50,7 @@ from cairn_map.wire.access_messages import (
 )
 from cairn_map.wire.change_messages import ChangesAnswer
 from cairn_map.wire.frames import FRAME_BYTES_MAX, JSON_BYTES_MAX, Frame
+from cairn_map.wire.hot_spot_messages import HotSpotsAnswer
 from cairn_map.wire.hottest_messages import HottestAnswer
 from cairn_map.wire.layer_messages import LAYER_FORMAT, AddLayer, LayerAdded, LayerInfo
 from cairn_map.wire.mark_messages import AttachmentState, MarkPage, MarkReceipt, MarkRequest, WantedAttachments
@@ -344,6 +345,14 @@ class MapApi:
         """The occupied voxels of the highest temperature; a box is x0, y0, z0, x1, y1, z1 in metres."""
         params = {"count": str(count)} | ({"box": ",".join(map(str, box_m))} if box_m else {})
         return message_from_json(HottestAnswer, self._ask("GET", f"/maps/{name}/main/hottest", params=params))
+
+    def hot_spots(
+        self, name: str, *, over_k: float, min_voxels: int, count: int, box_m: Sequence[float] | None = None
+    ) -> HotSpotsAnswer:
+        """The first `count` hot spots of a map, or of a box in metres; asked again until it is `complete`."""
+        params = {"over_k": repr(over_k), "min_voxels": str(min_voxels), "count": str(count)}
+        params |= {"box": ",".join(map(str, box_m))} if box_m else {}
+        return message_from_json(HotSpotsAnswer, self._ask("GET", f"/maps/{name}/main/hotspots", params=params))
 
     def marks(self, name: str, *, box_m: Sequence[float] | None = None, after: str | None = None) -> MarkPage:
         """A page of the marks of a map, or of a box in metres; all: `mark_pages.mark_pages`."""

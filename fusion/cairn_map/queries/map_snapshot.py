@@ -30,11 +30,12 @@ from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.grid import Cell, Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.evidence.voxels import Reading, Voxels
-from cairn_map.queries import body_queries, distance_queries, floor_grid, point_queries, region_queries
+from cairn_map.queries import body_queries, distance_queries, floor_grid, hot_spots, point_queries, region_queries
 from cairn_map.queries.body_queries import PathStates
 from cairn_map.queries.distance_queries import Nearest, RayEnds
 from cairn_map.queries.floor_grid import Band, FloorGrid
 from cairn_map.queries.frozen_map import Box, FreezableMap, FrozenMap, freeze
+from cairn_map.queries.hot_spots import Spots
 from cairn_map.queries.occupancy_states import State
 from cairn_map.queries.region_queries import MapImage
 
@@ -266,6 +267,25 @@ class MapSnapshot:
             box_m: only voxels in this box.
         """
         return region_queries.hottest(self._frozen, n, min_probability=min_probability, box_m=box_m)
+
+    def hot_spots(
+        self,
+        *,
+        over_k: float = hot_spots.WARM_K,
+        voxels_min: int = hot_spots.VOXELS_MIN,
+        box_m: Box | None = None,
+    ) -> Spots:
+        """Connected occupied voxels above a temperature: confirmed spots first, then the others, each hottest first.
+
+        A spot is confirmed if one of its voxels was hit in two scans, or if it has four: others may be ghosts. The
+        times of samples are those of `measured_at`.
+
+        Args:
+            over_k: least temperature of each voxel, kelvin.
+            voxels_min: least number of the voxels of a spot.
+            box_m: only spots whose hottest voxel's centre lies in this box.
+        """
+        return hot_spots.spots_of_map(self._frozen, over_k=over_k, voxels_min=voxels_min, box_m=box_m)
 
     def voxels_in(self, box_m: Box | None = None) -> Voxels:
         """All voxels with evidence in a box, cell by cell in Morton order."""

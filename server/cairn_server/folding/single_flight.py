@@ -21,9 +21,16 @@ class MadeOnce(Generic[K, V]):
     """
 
     def __init__(
-        self, *, limit_bytes: int, size_of: Callable[[V], int], steady_s: Callable[[], float] = time.monotonic
+        self,
+        *,
+        limit_bytes: int,
+        size_of: Callable[[V], int],
+        idle_s: float = IDLE_S,
+        steady_s: Callable[[], float] = time.monotonic,
     ) -> None:
+        """Keep values up to so many bytes, each for so long after its last request (infinite: as long as they fit)."""
         self._limit_bytes = limit_bytes
+        self._idle_s = idle_s
         self._size_of = size_of
         self._steady_s = steady_s
         self._lock = threading.Lock()
@@ -71,7 +78,7 @@ class MadeOnce(Generic[K, V]):
         self._size_bytes += self._size_of(value)
         while self._kept:
             oldest, (least, used_s) = next(iter(self._kept.items()))
-            if self._size_bytes <= self._limit_bytes and now_s - used_s <= IDLE_S:
+            if self._size_bytes <= self._limit_bytes and now_s - used_s <= self._idle_s:
                 return
             del self._kept[oldest]
             self._size_bytes -= self._size_of(least)

@@ -179,7 +179,14 @@ def _views_of(service: Service) -> AbstractContextManager[object]:
     """Views made ahead, by a server that shows any."""
     if service.settings.folding == "only":
         return nullcontext()
-    return closing(ViewPrefetch(service.store, service.views.cells.cache, service.fold_news))
+    return closing(
+        ViewPrefetch(
+            service.store,
+            service.views.cells.cache,
+            service.fold_news,
+            on_read=service.views.hot_spots.prepare,
+        )
+    )
 
 
 def _serve(service: Service, listener: socket.socket, long_bodies: LongBodies, life: Life) -> None:

@@ -20,6 +20,7 @@ from cairn_map.codec.layer_code import encode_layer_cell
 from cairn_map.codec.view_code import VERSION, encode_view
 from cairn_map.epochs.cell_history import history_fingerprint
 from cairn_map.errors import BadInputError, DamagedDataError, NotFoundError
+from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.fingerprint import Fingerprint, fingerprint
 from cairn_map.evidence.grid import CellKey, Geometry, cell_of_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
@@ -124,10 +125,23 @@ def view_of_stored(row: MapRow, stored: CellRow, depth: int) -> bytes:
     Raises:
         DamagedDataError: kind `damaged_store`: its bytes are not sound.
     """
-    # Voxels without a hit have a probability below a half: a view that does not show them can leave out most of a cell.
-    read = stored_surface_reading if row.sensor_model.p_occupied >= 0.5 else stored_reading
     with DECODING.of_cell(row.geometry, stored.voxels):
-        return encode_view(stored.key, read(stored, row), row.geometry, row.sensor_model, style=ViewStyle(depth=depth))
+        return view_of_reading(row, stored, shown_reading(row, stored), depth)
+
+
+def shown_reading(row: MapRow, stored: CellRow) -> Evidence:
+    """Evidence of a stored cell, as far as a view shows it.
+
+    Raises:
+        DamagedDataError: kind `damaged_store`: its bytes are not sound.
+    """
+    # Voxels without a hit have a probability below a half: a view that does not show them can leave out most of a cell.
+    return (stored_surface_reading if row.sensor_model.p_occupied >= 0.5 else stored_reading)(stored, row)
+
+
+def view_of_reading(row: MapRow, stored: CellRow, evidence: Evidence, depth: int) -> bytes:
+    """View of what was read of a stored cell, at an octree depth."""
+    return encode_view(stored.key, evidence, row.geometry, row.sensor_model, style=ViewStyle(depth=depth))
 
 
 class ViewCache:

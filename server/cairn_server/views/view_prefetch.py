@@ -1,4 +1,4 @@
-"""Coarse views of all cells, made before a page asks, so that the first picture of a map is ready at once.
+"""Coarse views of all cells, and their hot spots, made before a page asks: its first picture and list are ready.
 
     start   -->  the views of all cells, the first of them without pauses
     folded  -->  a moment later, cell by cell with pauses between, what changed
@@ -12,16 +12,19 @@ servers did. A cell that changes all the time is made once in some seconds.
 import logging
 import threading
 import time
+from collections.abc import Callable
 
 from cairn_map.commits.cursor import Cursor
 from cairn_map.errors import CairnError, DamagedDataError
+from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey, cell_key, cell_of_key
+from cairn_server.cell_room import DECODING
 from cairn_server.live.fold_news import FoldNews
 from cairn_server.store.history import is_proven
 from cairn_server.store.objects.cold_bytes import AwayError
 from cairn_server.store.store import Store
-from cairn_server.store.store_rows import MapRow
-from cairn_server.views.cell_views import ViewCache, first_depth, view_name, view_of_stored
+from cairn_server.store.store_rows import CellRow, MapRow
+from cairn_server.views.cell_views import ViewCache, first_depth, shown_reading, view_name, view_of_reading
 
 log = logging.getLogger(__name__)
 
@@ -35,8 +38,17 @@ AT_ONCE = 100
 class ViewPrefetch:
     """Thread that makes and keeps views of a store's maps until closed."""
 
-    def __init__(self, store: Store, views: ViewCache, news: FoldNews, *, look_every_s: float = LOOK_EVERY_S) -> None:
-        """Begin; `news` has the maps that were folded."""
+    def __init__(
+        self,
+        store: Store,
+        views: ViewCache,
+        news: FoldNews,
+        *,
+        look_every_s: float = LOOK_EVERY_S,
+        on_read: Callable[[MapRow, CellRow, Evidence], None] = lambda *_: None,
+    ) -> None:
+        """Begin; `news` has the maps that were folded, and `on_read` gets what was read of each cell."""
+        self._on_read = on_read
         self._store = store
         self._views = views
         self._news = news
@@ -124,6 +136,12 @@ class ViewPrefetch:
             with self._store.snapshot(row) as snapshot:
                 stored = snapshot.cell(key)
             if stored is not None:
-                self._views.view(view_name(row, stored, depth), lambda: view_of_stored(row, stored, depth))
+                self._views.view(view_name(row, stored, depth), lambda: self._view(row, stored, depth))
         except (DamagedDataError, AwayError) as exc:
             log.info("no view of cell %s before a client asks for it: %s", cell_of_key(key), exc.message)
+
+    def _view(self, row: MapRow, stored: CellRow, depth: int) -> bytes:
+        with DECODING.of_cell(row.geometry, stored.voxels):
+            evidence = shown_reading(row, stored)
+            self._on_read(row, stored, evidence)
+            return view_of_reading(row, stored, evidence, depth)

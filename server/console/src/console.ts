@@ -4,6 +4,7 @@ import { NONE_READY, type Api } from "./api.ts";
 import { Appearance } from "./appearance.ts";
 import { h } from "./dom.ts";
 import { Duties } from "./duties.ts";
+import { FindingsDesk } from "./findings_desk.ts";
 import { LogBook } from "./log_book.ts";
 import { LiveLink, type LinkState } from "./live.ts";
 import { toHash, type CameraView, type Field, type Look } from "./look.ts";
@@ -41,6 +42,7 @@ export class Console {
   readonly team: Team;
   readonly book: LogBook;
   readonly duties: Duties;
+  readonly findings: FindingsDesk;
   readonly strip = new CommitStrip();
   readonly voxel: VoxelPanel;
   readonly measure: MeasurePanel;
@@ -96,7 +98,13 @@ export class Console {
     this.picker = new Picker(this.stage, this.cells);
     this.stage.add(this.cells.group, this.grid.lines, this.unseen.lines, this.outline.lines, this.measure.lines, this.team.group);
     this.camera = new CameraPanel(this.stage, this.cells, this.team, info, camera);
-    left.append(this.dutyPanel.element, this.camera.element, this.team.panel.element, mapFacts(info));
+    this.findings = new FindingsDesk(api, info, { stage: this.stage, cells: this.cells, picker: this.picker }, look, {
+      fly: (to) => this.camera.go(to), look: () => this.apply(), say: (text) => this.say(text), isOperator: () => this.duties.isOperator,
+      witness: (commit) => this.book.placeOf(commit),
+    });
+    this.stage.add(this.findings.pins.group);
+    view.append(this.findings.pins.element, this.findings.alarm.banner);
+    left.append(this.dutyPanel.element, this.findings.panel.element, this.camera.element, this.team.panel.element, mapFacts(info));
     this.appearance = new Appearance(look, this.stage, this.cells, this.book);
     view.append(this.appearance.legend.element);
     this.connect(onRefused);
@@ -122,6 +130,7 @@ export class Console {
     window.clearInterval(this.timer);
     this.link.close();
     this.cells.dispose();
+    this.findings.dispose();
     this.picker.dispose();
     this.appearance.dispose();
     this.stage.dispose();
@@ -155,6 +164,10 @@ export class Console {
   /** Outline and name what lies under a place of the canvas. */
   ask(x: number, y: number): void {
     const picked = this.picker.at(x, y);
+    if (this.findings.isMarking) {
+      if (picked) this.findings.mark(picked.point);
+      return;
+    }
     if (this.measure.isOn) {
       if (picked) this.measure.add(picked.point);
       return;
@@ -170,6 +183,7 @@ export class Console {
     this.outline.show(null);
     this.team.follow(null);
     this.voxel.clear();
+    this.findings.forget();
     this.say("");
     this.stage.draw();
   }
@@ -190,6 +204,7 @@ export class Console {
     this.stage.onMove = () => (this.moved = true);
     this.stage.onFrame = () => {
       this.team.place();
+      this.findings.pins.place();
       // Without a graphics card, frames would take the time of the cells that are still to come.
       return this.cells.isFresh && !(this.stage.isSoftware && this.cells.isFetching);
     };
@@ -216,7 +231,7 @@ export class Console {
       else delete this.look.ranges[this.look.field];
       this.apply();
     };
-    this.strip.onChoose = (entry) => openCommit(this.api, this.info.name, entry);
+    this.strip.onChoose = (entry) => openCommit(this.api, this.info.name, entry, this.duties.isOperator);
     this.dutyPanel.onAsking = (asking) => openAsking(this.duties, asking);
     this.dutyPanel.onFull = (robot) => openFull(this.api, this.info.name, this.duties, robot);
     this.team.onFollow = () => this.stage.draw();
@@ -230,6 +245,7 @@ export class Console {
   }
 
   private heard(event: LiveEvent): void {
+    this.findings.hear(event);
     if (event.type === "hello") {
       this.team.greet(event.robots);
       if (!event.resumed) void this.loading.then(() => (this.cursor === event.cursor ? undefined : this.reloadAll()));
@@ -315,6 +331,7 @@ export class Console {
       void this.reload();
     }
     this.duties.tick();
+    this.findings.tick();
     this.dutyPanel.show(this.duties);
     this.team.tick(this.look.field, this.cells.head, this.duties.full);
     this.strip.show(this.team.names);

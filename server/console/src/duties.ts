@@ -25,6 +25,8 @@ export class Duties {
   /** Keys that were refused on this computer. */
   readonly refused: Set<string>;
   private isMine = true;
+  /** The server let an operator see what waits for operators. */
+  private isProven = false;
   private isAsking = false;
   private askAtMs = 0;
   private readonly api: Api;
@@ -46,6 +48,11 @@ export class Duties {
   /** Ask at the next tick: something was done. */
   refresh(): void {
     this.askAtMs = 0;
+  }
+
+  /** Whether who looks may mark, dismiss and retract; until the server has said so, no. */
+  get isOperator(): boolean {
+    return this.isMine && this.isProven;
   }
 
   /** The shares that are more than half used, one line for each robot. */
@@ -77,6 +84,7 @@ export class Duties {
     this.isAsking = true;
     try {
       this.keys = await this.api.json<RobotKeys>(`maps/${this.map}/keys`);
+      this.isProven = true;
       this.uses = await this.api.json<RobotUse[]>(`maps/${this.map}/robots`);
     } catch (error) {
       if (error instanceof ApiError && error.status === 403) this.isMine = false;

@@ -62,8 +62,8 @@ export class LiveLink {
       this.watch();
       this.onState({ live: true, heardMs: this.heardMs });
       this.onEvent(event);
-      // `cells` and `log` of a step may come twice; what ends it moves on.
-      if (event.type !== "cells" && event.type !== "log") this.seen = event.id;
+      // `cells`, `marks` and `log` of a step may come twice; what ends it moves on.
+      if (!["cells", "marks", "log"].includes(event.type)) this.seen = event.id;
     };
     socket.onclose = (event) => this.lost(socket, event.code);
     this.watch();

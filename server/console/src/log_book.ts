@@ -108,6 +108,12 @@ export class LogBook {
     return entry && !this.isOut(seq) ? robotOf(entry.id) : null;
   }
 
+  /** From where a commit was measured last, m in the map; null: not known here. */
+  placeOf(id: string): Triple | null {
+    for (const known of this.known.values()) if (known.id === id && known.at) return known.at;
+    return null;
+  }
+
   /** Whether an entry took evidence out. */
   isOut(seq: number): boolean {
     return this.known.get(seq)?.isOut === true;

@@ -72,12 +72,15 @@ function share(): void {
   dialog.showModal();
 }
 
+const NUMBERED = ["1", "2", "3", "4", "5", "6", "7", "8", "9"];
 const keys: Key[] = [
-  ...FIELDS.map(({ field, label }, n) => ({ keys: [String(n + 1)], what: `Colour by ${label.toLowerCase()}`, run: () => open?.setField(field) })),
+  ...FIELDS.map(({ field, label }, n) => ({ keys: [`Shift+${n + 1}`], what: `Colour by ${label.toLowerCase()}`, run: () => open?.setField(field) })),
   { keys: ["h", "f"], what: "All of the map", run: () => open?.camera.home() },
   { keys: ["t"], what: "From above", run: () => open?.camera.top() },
   { keys: ["w"], what: "Inside, at a person's height", run: () => open?.camera.walk() },
   { keys: ["x"], what: "The hottest place shown", run: () => open?.camera.hottest() },
+  { keys: NUMBERED, what: "Fly to the finding of that number", run: (key) => open?.findings.flyTo(Number(key)) },
+  { keys: ["n"], what: "Mark: the next click names a place", run: () => open?.findings.startMarking() },
   { keys: ["["], what: "Ceiling down 10 cm", run: () => open?.step(false) },
   { keys: ["]"], what: "Ceiling up 10 cm", run: () => open?.step(true) },
   { keys: ["m"], what: "Measure: clicks set points", run: () => open?.measure.switch() },

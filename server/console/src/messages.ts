@@ -112,6 +112,7 @@ export interface ExportTicket {
 export type LiveEvent =
   | { type: "hello"; id: string; map: string; cursor: string; resumed: boolean; robots: RobotSign[]; beat_s: number }
   | { type: "cells"; id: string; cells: [number, number, number, number][] | "many" }
+  | { type: "marks"; id: string; marks: MarkEntry[] | "many"; removed: string[] }
   | { type: "log"; id: string; entries: LogEntry[]; left_out: number }
   | { type: "head"; id: string; cursor: string }
   | { type: "robot"; id: string; robot: RobotSign }
@@ -143,4 +144,65 @@ export interface RobotClosed {
   robot: string;
   incarnations: number;
   intervals: number;
+}
+
+/** Connected voxels above a temperature: PROTOCOL.md section 4.15. */
+export interface HotSpot {
+  voxel: Triple;
+  point_m: Triple;
+  celsius: number;
+  sigma: number;
+  weight: number;
+  hits: number;
+  misses: number;
+  confirmed: boolean;
+  voxels: number;
+  low_m: Triple;
+  high_m: Triple;
+  over_floor_m: number | null;
+  measured_s?: number;
+  commit: string | null;
+  captured_s: [number, number] | null;
+}
+
+export interface HotSpots {
+  cursor: string;
+  complete: boolean;
+  total: number;
+  spots: HotSpot[];
+}
+
+/** A place with a name, as its author wrote it: PROTOCOL.md section 4.17; what equals its default may be left out. */
+export interface Mark {
+  kind: string;
+  name: string;
+  place_mm: Triple;
+  extent_mm?: Triple;
+  note?: string;
+  time_ms: number;
+  by?: string;
+}
+
+export interface MarkEntry {
+  /** `robot.incarnation.n:number` */
+  key: string;
+  mark: Mark;
+  amends?: string[];
+}
+
+export interface MarkPage {
+  cursor: string;
+  from_start: boolean;
+  more: boolean;
+  marks: MarkEntry[];
+  removed: string[];
+}
+
+/** A mark as a person states it; the server adds who and when. */
+export interface MarkText {
+  kind: string;
+  name: string;
+  place_m: Triple;
+  extent_m?: Triple;
+  note?: string;
 }

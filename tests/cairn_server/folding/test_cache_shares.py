@@ -8,12 +8,13 @@ from tests.fixtures.server.live import Live, Process
 
 from cairn_server.folding import fold_memory, read_cache
 from cairn_server.memory_shares import CACHES_BYTES, CACHES_MIN_BYTES, LIMIT_MIN_BYTES, memory_shares
-from cairn_server.views import map_views
+from cairn_server.views import hot_spot_search, map_views
 
 
 def test_the_standard_sizes_of_all_caches_add_up() -> None:
     of_reading = (read_cache.EVIDENCE_BYTES, read_cache.STAMPS_BYTES, read_cache.CHANGES_BYTES, read_cache.DIFFS_BYTES)
-    of_views = (map_views.CELLS_BYTES, map_views.LISTS_BYTES)
+    of_spots = (hot_spot_search.PIECES_BYTES, hot_spot_search.WITNESSES_BYTES)
+    of_views = (map_views.CELLS_BYTES, map_views.LISTS_BYTES, *of_spots)
     assert sum((fold_memory.CACHE_BYTES, *of_reading, read_cache.HISTORIES_BYTES, *of_views)) == CACHES_BYTES
 
 
@@ -26,6 +27,7 @@ def test_each_cache_has_its_share(tmp_path: Path) -> None:
         assert caches._evidence._limit_bytes == int(share * read_cache.EVIDENCE_BYTES)
         assert caches.changes._limit_bytes == int(share * read_cache.CHANGES_BYTES)
         assert service.views.pictures._read_cells._limit_bytes == int(share * map_views.CELLS_BYTES)
+        assert service.views.hot_spots._pieces._limit_bytes == int(share * hot_spot_search.PIECES_BYTES)
 
 
 @pytest.mark.processes

@@ -11,6 +11,7 @@
     $ cairn map publish http://127.0.0.1:8750/maps/lab --foxglove 8766
     $ cairn map log http://127.0.0.1:8750/maps/lab --graph
     $ cairn map changes http://127.0.0.1:8750/maps/lab --since 14:05
+    $ cairn map hotspots http://127.0.0.1:8750/maps/lab --over 40
     $ cairn map marks http://127.0.0.1:8750/maps/lab
     $ cairn map mark http://127.0.0.1:8750/maps/lab --add "north door" --at 1.5,-2,1 --kind door
     $ cairn map layer add http://127.0.0.1:8750/maps/lab fine --voxel 0.01
@@ -33,7 +34,7 @@ import time
 from pathlib import Path
 
 from cairn_calib.rig.rig import load_rig
-from cairn_client.cli import layers, marks, publish
+from cairn_client.cli import hot_spots, layers, marks, publish
 from cairn_client.cli.arguments import (
     Subparsers,
     add_map_parser,
@@ -79,6 +80,7 @@ def main(argv: list[str]) -> int:
         changes.add_parser,
         map_export.add_get_parser,
         map_export.add_export_parser,
+        hot_spots.add_parser,
         marks.add_list_parser,
         marks.add_parser,
         layers.add_parser,

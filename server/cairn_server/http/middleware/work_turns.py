@@ -30,7 +30,7 @@ WAIT_S = 30.0
 PICTURE_WAIT_S = 5.0
 MISSING = re.compile(r"/maps/[^/]*/branches/[^/]*/missing")
 PICTURES = re.compile(r"/maps/[^/]*/main/render")
-SEARCHES = re.compile(r"/maps/[^/]*/main/(changes|hottest)")
+SEARCHES = re.compile(r"/maps/[^/]*/main/(changes|hottest|hotspots)")
 CELL_FILES = re.compile(r"/maps/[^/]*/main/cells/[^/]*\.(npz|ply)")
 EXPORTS = re.compile(r"/maps/[^/]*/main/export(/tickets)?")
 

@@ -10,8 +10,10 @@ from starlette.types import Receive, Scope, Send
 from cairn_map.epochs.moment import TimeText
 from cairn_map.errors import DeniedError
 from cairn_map.files.export_request import BOX_CHARS_MAX, EXPORT_TYPES, ExportRequest, ExportTicket, TicketedExport
+from cairn_map.queries.hot_spots import VOXELS_MIN, WARM_K
 from cairn_map.render.render_request import RenderRequest
 from cairn_map.wire.change_messages import ChangesAnswer
+from cairn_map.wire.hot_spot_messages import SPOTS_MAX, VOXELS_MAX, HotSpotsAnswer
 from cairn_map.wire.hottest_messages import HOTTEST_MAX, HottestAnswer
 from cairn_server.access.connection_places import ConnectionPlace
 from cairn_server.http.middleware.deadlines import PLACE
@@ -98,6 +100,23 @@ def hottest(
 ) -> HottestAnswer:
     """The occupied voxels of the highest temperature: first those that were seen twice or touch a surface."""
     return service.views.hottest.asked(row, count, box)
+
+
+@router.get("/maps/{name}/main/hotspots", dependencies=READERS)
+def hot_spots(
+    service: Operations,
+    row: Map,
+    over_k: Annotated[
+        float, Query(ge=0, le=1e5, allow_inf_nan=False, description="least temperature of a spot's voxels, kelvin")
+    ] = WARM_K,
+    min_voxels: Annotated[int, Query(ge=1, le=VOXELS_MAX)] = VOXELS_MIN,
+    count: Annotated[int, Query(ge=1, le=SPOTS_MAX)] = 50,
+    box: Annotated[
+        str | None, Query(max_length=BOX_CHARS_MAX, description="x0,y0,z0,x1,y1,z1: metres, map frame")
+    ] = None,
+) -> HotSpotsAnswer:
+    """The hot spots: connected occupied voxels above a temperature, with place, size, height, who and when."""
+    return service.views.hot_spots.asked(row, over_k=over_k, voxels_min=min_voxels, count=count, box=box)
 
 
 async def map_without_ticket(name: str, request: Request, asker: Asking) -> MapRow | None:

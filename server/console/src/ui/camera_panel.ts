@@ -9,6 +9,7 @@ import { uniforms } from "../scene/materials.ts";
 import type { Stage } from "../scene/stage.ts";
 import { standing } from "../scene/standpoint.ts";
 import { hottest, type HotPlace } from "../scene/statistics.ts";
+import { visibleFrom } from "../scene/viewpoint.ts";
 import type { Team } from "../team.ts";
 
 const SIDE = new Vector3(-0.7, -1, 0.75);
@@ -53,18 +54,18 @@ export class CameraPanel {
   }
 
   home(): void {
-    this.fly(this.stage.lookAt(this.cells.tightBoxes, SIDE));
+    this.go(this.stage.lookAt(this.cells.tightBoxes, SIDE));
   }
 
   top(): void {
-    this.fly(this.stage.lookAt(this.cells.tightBoxes, ABOVE));
+    this.go(this.stage.lookAt(this.cells.tightBoxes, ABOVE));
   }
 
   /** Stand on the floor, as near as can be to where a robot is, and look where most of the map is seen. */
   walk(): void {
     const target = new Vector3(...this.stage.view.target);
     const view = standing(this.cells, this.team.nearest(target) ?? target);
-    if (view) this.fly(view);
+    if (view) this.go(view);
     else this.onNoFloor();
   }
 
@@ -73,11 +74,12 @@ export class CameraPanel {
     const { uLow, uHigh, uMinP } = uniforms;
     const shown = new Box3(uLow.value, uHigh.value);
     const found = hottest(this.cells, (place, p) => shown.containsPoint(place) && p >= uMinP.value);
-    if (found) this.fly(this.stage.lookAt([new Box3().setFromCenterAndSize(found.centre, new Vector3(1.6, 1.6, 1.6))], SIDE));
+    if (found) this.go(visibleFrom(this.cells, found.centre, this.stage.camera.position));
     this.onHottest(found);
   }
 
-  private fly(to: CameraView): void {
+  /** Fly somewhere, and follow nobody any more. */
+  go(to: CameraView): void {
     this.onGo();
     this.isPlaced = true;
     this.team.follow(null);

@@ -5,7 +5,7 @@ import { h } from "../dom.ts";
 export interface Key {
   readonly keys: readonly string[];
   readonly what: string;
-  readonly run: () => void;
+  readonly run: (key: string) => void;
 }
 
 /** Keys count wherever no text is typed. */
@@ -17,15 +17,17 @@ export function listen(keys: readonly Key[]): void {
     const own = event.key === "Enter" || event.key === " " ? "button, input, [role=button], pre" : "input";
     if ((event.key.length > 1 || event.key === " ") && event.key !== "Escape" && target.matches(own)) return;
     if (event.ctrlKey || event.metaKey || event.altKey || types || document.querySelector("dialog[open]")) return;
-    const found = keys.find((key) => key.keys.includes(event.key));
+    // With Shift digits are other signs, of which the keyboard's country decides.
+    const name = event.shiftKey && /^Digit\d$/.test(event.code) ? `Shift+${event.code.slice(5)}` : event.key;
+    const found = keys.find((key) => key.keys.includes(name));
     if (!found) return;
     event.preventDefault();
-    found.run();
+    found.run(name);
   });
 }
 
 export function showKeys(keys: readonly Key[]): void {
-  const rows = keys.map((key) => h("tr", {}, h("th", {}, ...key.keys.map((name) => h("kbd", {}, name === " " ? "Space" : name))), h("td", {}, key.what)));
+  const rows = keys.map((key) => h("tr", {}, h("th", {}, ...named(key.keys)), h("td", {}, key.what)));
   const close = h("button", { type: "button" }, "Close");
   const dialog = h(
     "dialog", { class: "keys", "aria-label": "Keys" }, h("h2", {}, "Keys"), h("table", {}, h("tbody", {}, ...rows)),
@@ -35,4 +37,10 @@ export function showKeys(keys: readonly Key[]): void {
   dialog.addEventListener("close", () => dialog.remove());
   document.body.append(dialog);
   dialog.showModal();
+}
+
+/** Many keys in a row are told by the first and the last. */
+function named(keys: readonly string[]): (HTMLElement | string)[] {
+  const shown = keys.map((name) => h("kbd", {}, name === " " ? "Space" : name));
+  return shown.length > 4 ? [shown[0], "to ", shown[shown.length - 1]] : shown;
 }

@@ -6,8 +6,8 @@ import { robotOf } from "../log_book.ts";
 import type { LogEntry, Retracted, RetractRequest } from "../messages.ts";
 import { bytes, clock } from "../units.ts";
 
-/** Open on one commit; closes when it is done or given up. */
-export function openCommit(api: Api, map: string, entry: LogEntry): void {
+/** Open on one commit; closes when it is done or given up. Who may not retract only looks. */
+export function openCommit(api: Api, map: string, entry: LogEntry, mayRetract: boolean): void {
   const robot = robotOf(entry.id);
   const [, last] = entry.captured_s ?? [0, 0];
   const what = h(
@@ -31,11 +31,15 @@ export function openCommit(api: Api, map: string, entry: LogEntry): void {
       ["size", `${bytes(entry.size_bytes)} in ${entry.cells} cells`],
       ["came by", entry.via ?? "its robot"],
     ]),
-    h("h3", {}, "Take out of the map"),
-    h("p", { class: "hint" }, "The map is then as if it had never been pushed, here and on every robot. It cannot be undone."),
-    h("label", { for: "what" }, "What"), what,
-    h("label", { for: "note" }, "Note"), note,
-    said, h("div", { class: "buttons" }, preview, confirm, close),
+    ...(mayRetract
+      ? [
+          h("h3", {}, "Take out of the map"),
+          h("p", { class: "hint" }, "The map is then as if it had never been pushed, here and on every robot. It cannot be undone."),
+          h("label", { for: "what" }, "What"), what,
+          h("label", { for: "note" }, "Note"), note, said,
+        ]
+      : []),
+    h("div", { class: "buttons" }, ...(mayRetract ? [preview, confirm] : []), close),
   );
   const request = (): RetractRequest => ({
     ...(what.value === "one" ? { commits: [entry.id] } : { robot }),
