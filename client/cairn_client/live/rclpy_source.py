@@ -19,7 +19,7 @@ from typing import Any
 from cairn_client.live.inbox import Inbox
 from cairn_client.live.live_source import bad_url, domain_of
 from cairn_fusion.ros.bag import BagMessage, Topic, Wire
-from cairn_fusion.ros.messages import plain_type
+from cairn_fusion.ros.messages import COMPRESSED, IMAGE, POINTS, plain_type
 from cairn_map.errors import BadInputError
 
 log = logging.getLogger(__name__)
@@ -30,8 +30,9 @@ LOOK_S = 0.25
 """Time between two looks at which topics there are."""
 SPIN_S = 0.1
 CLOSE_S = 3.0
-QUEUE = 10
-"""Messages of a topic that ROS keeps until they are taken."""
+IMAGES, SMALL = 10, 500
+"""Messages of a topic that ROS keeps until they are taken: of images and clouds, and of all others."""
+LARGE = frozenset([IMAGE, COMPRESSED, POINTS])
 ROS_HELP = (
     "source the ROS of this machine first (source /opt/ros/$ROS_DISTRO/setup.bash), and run cairn with its Python, "
     "3.11 or newer; with Humble's 3.10, or without ROS here, use the Foxglove bridge: ws://HOST:8765"
@@ -167,7 +168,7 @@ class RclpySource:
             node.destroy_subscription(known[1])
         qos: Any = importlib.import_module("rclpy.qos")
         profile = qos.QoSProfile(
-            depth=QUEUE,
+            depth=IMAGES if plain_type(kind) in LARGE else SMALL,
             reliability=qos.ReliabilityPolicy.RELIABLE if is_reliable else qos.ReliabilityPolicy.BEST_EFFORT,
             durability=qos.DurabilityPolicy.TRANSIENT_LOCAL if is_latched else qos.DurabilityPolicy.VOLATILE,
         )
