@@ -98,6 +98,14 @@ class ReadChains:
     def __init__(self, head: Cursor, layer_digest: bytes) -> None:
         self._known = {head.seq: head.chain, 0: first_chain(head.log_id, layer_digest)}
 
+    def note(self, entries: list[ChainedEntry]) -> list[ChainedEntry]:
+        """Keep the chains of entries that were read for another reason; returns the entries.
+
+        A header's vector since the asker's state reads all entries that its changed cells name later.
+        """
+        self._known.update((entry.seq, entry.chain) for entry in entries)
+        return entries
+
     def get(self, seq: int, read: Callable[[], bytes | None]) -> bytes | None:
         """The chain after entry `seq` (0: of the empty log), by `read` the first time; None: there is no such entry."""
         chain = self._known.get(seq)

@@ -311,7 +311,7 @@ def _candidates(snapshot: Snapshot, query: MissingQuery) -> list[CellRow]:
         return list(snapshot.cells(box=query.box))
     listed = query.listed.keys[query.wants(query.listed.keys)]
     # A list longer than the map: reading through the map is less than asking for each.
-    if len(listed) > snapshot.totals().cells:
+    if len(listed) and len(listed) > snapshot.totals().cells:
         return list(snapshot.cells(box=query.box))
     # What changed since the state of the cells that are not listed, and the listed ones, whatever their state.
     changed = {row.key: row for row in snapshot.cells(after_seq=query.cursor.seq, box=query.box)}

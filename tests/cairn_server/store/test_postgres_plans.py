@@ -139,6 +139,25 @@ def test_no_query_outside_of_snapshots_reads_through_commits(store: PgStore, sca
     assert scanned == []
 
 
+def test_chains_of_the_entries_of_a_vector_are_not_asked_for_again(
+    store: PgStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[object] = []
+    execute = psycopg.Connection.execute
+
+    def counted(self: Connection, query: Any, *args: Any, **options: Any) -> Any:
+        asked.append(query)
+        return execute(self, query, *args, **options)
+
+    with store.snapshot(store.map("large")) as found:
+        entries = found.chained(after_seq=COMMITS - 50, limit=50)
+        with monkeypatch.context() as counting:
+            counting.setattr(psycopg.Connection, "execute", counted)
+            chains = [found.chain_at(entry.seq) for entry in entries]
+    assert chains == [entry.chain for entry in entries] and len(chains) == 50
+    assert asked == []
+
+
 def test_idle_maps_cost_probes_and_metrics_no_statement(
     store: PgStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -139,6 +139,8 @@ class PgSnapshot:
 
     def cells_of(self, keys: Collection[CellKey]) -> list[CellRow]:
         """Those of these cells that are stored, without their bodies, by rising number."""
+        if not keys:
+            return []
         query = f"SELECT {CELL_COLUMNS} FROM cell WHERE {OF_MAP} AND cell = ANY(%(keys)s) ORDER BY cell"
         found = rows(self._connection, query, {"map": self._map, "keys": [int(key) for key in keys]})
         return [cell_row(row) for row in found]
@@ -206,14 +208,14 @@ class PgSnapshot:
         Raises:
             AwayError: they are in the object store, which does not answer.
         """
-        number = first(
-            self._connection, f"SELECT number FROM commits WHERE {OF_COMMIT}", (self._map, *commit.author, commit.n)
-        )
         query = (
             "SELECT body, segment, start_bytes, size_bytes FROM diff"
-            f" WHERE {OF_MAP} AND commit_number = %(number)s AND cell = %(key)s"
+            f" WHERE {OF_MAP} AND cell = %(key)s AND commit_number = (SELECT number FROM commits"
+            " WHERE map = %(map)s AND robot = %(robot)s AND incarnation = %(incarnation)s AND n = %(n)s)"
         )
-        found = first(self._connection, query, {"map": self._map, "number": number, "key": key})
+        robot, incarnation = commit.author
+        values = {"map": self._map, "key": key, "robot": robot, "incarnation": incarnation, "n": commit.n}
+        found = first(self._connection, query, values)
         if found is None:
             return None
         body, name, start, size_bytes = found
@@ -330,10 +332,11 @@ class PgSnapshot:
             " WHERE log.map = %s AND seq > %s ORDER BY seq LIMIT %s",
             (self._map, after_seq, limit),
         )
-        return [
+        entries = [
             ChainedEntry(seq, kind, CommitId(Author(robot, incarnation), n), sha, chain)
             for seq, kind, robot, incarnation, n, sha, chain in found
         ]
+        return self._chains.note(entries)
 
     def marks(self, *, after_seq: int | None, limit: int, box: MarkBox | None = None) -> list[MarkChange]:
         """Marks that changed after a log entry, or those of the map, in a box, oldest first: as `Snapshot.marks`."""

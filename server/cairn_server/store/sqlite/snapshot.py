@@ -259,10 +259,11 @@ class SqliteSnapshot:
             " JOIN commits ON commits.number = log.commit_number WHERE log.map = ? AND seq > ? ORDER BY seq LIMIT ?",
             (self._map, after_seq, limit),
         )
-        return [
+        entries = [
             ChainedEntry(seq, kind, CommitId(Author(robot, incarnation), n), sha, chain)
             for seq, kind, robot, incarnation, n, sha, chain in found
         ]
+        return self._chains.note(entries)
 
     def marks(self, *, after_seq: int | None, limit: int, box: MarkBox | None = None) -> list[MarkChange]:
         """Marks that changed after a log entry, or those of the map, in a box, oldest first: as `Snapshot.marks`."""
