@@ -44,7 +44,7 @@ class TopicStatus(BaseModel):
     is_offered: bool
     """True if a publisher is there now, as far as the bridge says."""
     dropped: int
-    """Messages that went for room before they were read."""
+    """Messages that went for room before they were read, or that the network lost as far as the door numbers them."""
 
 
 class LiveStatus(BaseModel):
