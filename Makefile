@@ -5,7 +5,7 @@ SHELL := bash
 .SHELLFLAGS := -euo pipefail -c
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := help
-.PHONY: help demo check test soak lint bench console lock clean system
+.PHONY: help demo check test test-ros2 soak lint bench console lock clean system
 # Installing comes before compiling, in the order in which the targets name them.
 .NOTPARALLEL:
 
@@ -18,6 +18,8 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 # One worker more than cores, for tests wait for servers and browsers a quarter of their time. By file, because the image is
 # built once per worker that runs a test of it; in tests/conftest.py's order.
 WORKERS := --numprocesses $(shell echo $$(( $$(getconf _NPROCESSORS_ONLN) + 1 ))) --maxprocesses 8 --dist loadfile --no-loadscope-reorder
+# Distribution of `make test-ros2`: kilted or jazzy.
+ROS2 ?= kilted
 # Of each target.
 SOAK_SECONDS ?= 600
 KERNELS := $(shell find */cairn_* -name "*_kernels.py" -o -name warm_up.py)
@@ -31,7 +33,7 @@ LOCK := build/lock/bin/uv --quiet pip compile --universal --python-version 3.11 
 SYSTEM_PACKAGES := buildah mmdebstrap curl chromium caddy octomap-tools:convert_octree postgresql:pg_createcluster
 
 help:  ## show this list
-	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-6s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z0-9-]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
 
 demo: .venv/run.stamp .venv/kernels.stamp .venv/console.stamp  ## three robots, one server, one map (DEMO_ARGS="...")
 	$(BIN)/cairn demo $(DEMO_ARGS)
@@ -41,6 +43,11 @@ check: .venv/dev.stamp .venv/kernels.stamp  ## laws and units only, in minutes: 
 
 test: .venv/dev.stamp .venv/kernels.stamp .venv/console.stamp | system  ## all tests, which CI runs (PYTEST_ARGS="...")
 	$(BIN)/python -m pytest $(WORKERS) $(PYTEST_ARGS)
+
+# Its ROS speaks by multicast, which must not leave this machine.
+test-ros2: .venv-ros2/$(ROS2).stamp  ## tests with a real ROS 2, from wheels, in an environment of its own (ROS2=jazzy)
+	unshare --map-root-user --net bash -c 'ip link set lo up multicast on && ip route add 224.0.0.0/4 dev lo && \
+		RMW_IMPLEMENTATION=rmw_fastrtps_cpp exec .venv-ros2/$(ROS2)/bin/python -m pytest -W default tests/ros2 $(PYTEST_ARGS)'
 
 soak: .venv/dev.stamp .venv/kernels.stamp  ## crash, crowd, siege, replicas, simulate sync, fuzz (SOAK_SECONDS=600 of each, SOAK_ARGS="cell"), bad links, kills, calibrations
 	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.crash --trials 1000 --kills 200)
@@ -79,7 +86,7 @@ lock:  ## write the packages of the container image, with their hashes, to docke
 	$(LOCK) --output-file docker/build.lock docker/build.in
 
 clean:  ## remove .venv, build/ and all caches
-	rm -rf .venv build dist server/cairn_server/static .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf .venv .venv-ros2 build dist server/cairn_server/static .mypy_cache .ruff_cache .pytest_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 .venv/bin/python:
@@ -94,6 +101,14 @@ clean:  ## remove .venv, build/ and all caches
 .venv/dev.stamp: pyproject.toml | .venv/bin/python
 	CAIRN_SKIP_CONSOLE=1 $(PIP) --editable '.[dev]'
 	touch $@ .venv/run.stamp
+
+# Third parties' wheels of ROS's own sources, for tests alone: their hashes are pinned.
+.venv-ros2/$(ROS2).stamp: pyproject.toml tests/ros2/$(ROS2).lock
+	$(PYTHON) -m venv --clear .venv-ros2/$(ROS2)
+	CAIRN_SKIP_CONSOLE=1 .venv-ros2/$(ROS2)/bin/pip install --quiet --disable-pip-version-check --editable '.[robot,live,server]' \
+		'pytest>=8.3' 'pytest-timeout>=2.3' 'foxglove-sdk>=0.30,<1'
+	.venv-ros2/$(ROS2)/bin/pip install --quiet --disable-pip-version-check --require-hashes --no-deps --requirement tests/ros2/$(ROS2).lock
+	touch $@
 
 .venv/kernels.stamp: $(KERNELS) | .venv/bin/python
 	# Numba keeps a kernel by its own file's age: one that calls a kernel of another file would stay as it was.

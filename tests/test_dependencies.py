@@ -20,6 +20,7 @@ FAMILIES = {
     "Apache-2.0": r"Apache[- ](Software License|2\.0( WITH LLVM-exception)?)",
     "PSF-2.0": r"PSF-2\.0|Python Software Foundation License",
     "MPL-2.0": r"MPL-2\.0|Mozilla Public License 2\.0 \(MPL 2\.0\)",
+    "EPL-2.0": r"Eclipse Public License 2\.0 \(EPL-2\.0\)|EPL-2\.0",
     "ISC": r"ISC( License \(ISCL\))?",
     "Zlib": r"Zlib",
     "CC0-1.0": r"CC0-1\.0",
@@ -94,7 +95,7 @@ def test_every_package_has_a_licence_that_the_page_allows() -> None:
 
 
 def test_the_page_lists_what_the_image_holds_and_what_we_ask_for() -> None:
-    names = {name_of(requirement.name) for requirement in asked("robot", "server", "report")}
+    names = {name_of(requirement.name) for requirement in asked("robot", "live", "server", "report")}
     assert (names | {name for name, _ in locked()}) - listed().keys() == set()
 
 

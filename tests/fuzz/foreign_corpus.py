@@ -62,6 +62,8 @@ def _messages(make: Messages) -> Iterator[tuple[str, Any]]:
     yield "tf", make.tf(make.transform(t, "odom", "base_link", POSE), make.transform(t, "base_link", eye, POSE))
     yield "odometry", make.odometry(t, "odom", "base_link", POSE)
     yield "pose", make.pose_stamped(t, "odom", POSE)
+    stamped = [make.pose_stamped(t, "map", POSE), make.pose_stamped(t + 1, "", POSE)]
+    yield "path", make.make("nav_msgs/Path", header=make.header(t, "map"), poses=stamped)
     yield "info", make.info(t, eye, LENS)
     for encoding, pixels in (("16UC1", COUNTS), ("32FC1", COUNTS.astype(np.float32)), ("mono8", COUNTS.astype("u1"))):
         yield encoding, make.image(t, eye, pixels, encoding)

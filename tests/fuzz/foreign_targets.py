@@ -19,6 +19,7 @@ from cairn_fusion.ros.messages import (
     COMPRESSED,
     IMAGE,
     ODOMETRY,
+    PATH,
     POINTS,
     POSES,
     STAMPED,
@@ -26,6 +27,7 @@ from cairn_fusion.ros.messages import (
     read_compressed_image,
     read_header,
     read_image,
+    read_path,
     read_pose,
     read_transforms,
 )
@@ -75,6 +77,8 @@ def _use_message(kind: str, message: bytes, wire: Wire) -> None:
         info = read_camera_info(message, wire)
         for is_rectified in (False, True):
             camera_of_info(info, is_rectified=is_rectified, name="it")
+    elif kind == PATH:
+        assert len(read_path(message, wire).poses) * 68 <= len(message)
     elif kind == POINTS:
         points = read_points(message, wire)
         elevations_of(points)

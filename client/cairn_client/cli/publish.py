@@ -14,12 +14,16 @@ Topics, all in the frame `map` (--frame), lengths in metres, temperatures in deg
     /cairn/points               sensor_msgs/PointCloud2: all occupied voxels, at most every 10 s
     /cairn/changed_points       sensor_msgs/PointCloud2: those of the cells that changed
     /cairn/hot_spots            visualization_msgs/MarkerArray: the ten hottest places
+    /cairn/marks                visualization_msgs/MarkerArray: what robots and people marked
     /cairn/octomap              octomap_msgs/Octomap: occupied and free space, once, with --octomap
     /tf                         tf2_msgs/TFMessage: robots that report where they are, each the frame of its name
     /cairn/robots/NAME/path     nav_msgs/Path: the way of one since publishing began, at most every 3 s
 
 The storey of /map is that of --ground; without it the largest one, chosen again after each change, but left only for
 one with twice its free area. A viewer that joins late gets the newest message of each topic at once.
+
+--through ws://robot:8765 sends all but /tf to a robot's own Foxglove bridge, which publishes it there: Nav2 gets /map,
+and this machine needs no ROS. A bridge keeps nothing for nodes that come late, so /map is sent again every 5 s.
 
 A file is FILE.part until the command ends, at a change's number, by Ctrl-C or by SIGTERM; then it has its index.
 
@@ -45,7 +49,7 @@ from cairn_client.cli.floor_arguments import add_floor_arguments
 from cairn_client.http.api import MapApi
 from cairn_client.http.live_listener import Lost, listen
 from cairn_map.errors import BadInputError, UnreachableError
-from cairn_map.wire.live_events import CellsEvent, Hello, RobotHeard
+from cairn_map.wire.live_events import CellsEvent, Hello, MarksEvent, RobotHeard
 
 if TYPE_CHECKING:
     from cairn_client.publish.followed_map import FollowedMap
@@ -67,7 +71,11 @@ def add_parser(commands: Subparsers) -> None:
         "--origin", action="append", default=[], type=_origin, metavar="ORIGIN", help="its pages may join, too"
     )
     publish.add_argument("--mcap", type=Path, metavar="FILE", help="write the messages into a file")
-    publish.add_argument("--follow", action="store_true", help="go on with each change; with --foxglove it does")
+    publish.add_argument("--through", metavar="URL", help="send to the Foxglove bridge at ws://HOST:PORT, for its ROS")
+    publish.add_argument("--ca", type=Path, metavar="FILE", help="issuer of the certificate of wss:// (this machine's)")
+    publish.add_argument(
+        "--follow", action="store_true", help="go on with each change; with --foxglove or --through it does"
+    )
     publish.add_argument("--changes", type=int, metavar="N", help="end after so many changes, the first state included")
     publish.add_argument("--octomap", action="store_true", help="the octree of occupied and free space, too, once")
     publish.add_argument("--frame", default="map", type=_frame, metavar="NAME", help="frame of the map (map)")
@@ -79,6 +87,7 @@ def add_parser(commands: Subparsers) -> None:
 def _run(args: argparse.Namespace) -> int:
     _check_options(args)
     try:
+        from cairn_client.publish.bridge_sink import BridgeSink
         from cairn_client.publish.followed_map import FollowedMap
         from cairn_client.publish.foxglove_server import FoxgloveServer
         from cairn_client.publish.map_publisher import FloorChoice, MapPublisher, Sink
@@ -101,6 +110,9 @@ def _run(args: argparse.Namespace) -> int:
             )
             sinks.append(server)
             _say_at_once(f'{name} at {server.url}: open it in Foxglove or Lichtblick ("Foxglove WebSocket")')
+        if args.through is not None:
+            sinks.append(open_parts.enter_context(BridgeSink(args.through, ca_file=args.ca)))
+            _say_at_once(f"{name} through {args.through}")
         if args.mcap is not None:
             file = McapFile(args.mcap)
             # After it is closed, also by Ctrl-C, which is how a file that follows a map ends.
@@ -108,7 +120,7 @@ def _run(args: argparse.Namespace) -> int:
             sinks.append(open_parts.enter_context(file))
         choice = FloorChoice(ground_m=args.ground, band_m=args.band, frame=args.frame)
         publisher = MapPublisher(api, followed, sinks, choice)
-        if args.foxglove is None and not args.follow:
+        if not (args.follow or args.foxglove is not None or args.through is not None):
             _publish_once(api, followed, publisher, args)
         else:
             _follow(api, followed, publisher, args)
@@ -121,9 +133,12 @@ def _check_options(args: argparse.Namespace) -> None:
     Raises:
         BadInputError: kind `nothing_asked`, `bad_option`.
     """
-    if args.foxglove is None and args.mcap is None:
-        raise BadInputError("nothing_asked", "say where to publish: --foxglove PORT, or --mcap FILE")
-    if args.changes is not None and (args.changes < 1 or not (args.follow or args.foxglove is not None)):
+    is_live = args.foxglove is not None or args.through is not None
+    if not is_live and args.mcap is None:
+        raise BadInputError("nothing_asked", "say where to publish: --foxglove PORT, --through URL, or --mcap FILE")
+    if args.ca is not None and args.through is None:
+        raise BadInputError("bad_option", "--ca is about a bridge behind TLS: give --through wss://HOST:PORT, too")
+    if args.changes is not None and (args.changes < 1 or not (args.follow or is_live)):
         raise BadInputError("bad_option", "--changes N, 1 or more, is for a map that is followed: give --follow, too")
     if args.origin and args.foxglove is None:
         raise BadInputError("bad_option", "--origin is about viewers: give --foxglove PORT, too")
@@ -144,6 +159,7 @@ def _ended_by_sigterm() -> Iterator[None]:
 
 def _publish_once(api: MapApi, followed: "FollowedMap", publisher: "MapPublisher", args: argparse.Namespace) -> None:
     publisher.publish_changes(followed.fetch())
+    publisher.publish_marks()
     if args.octomap:
         publisher.publish_octree()
     for branch in api.branches(followed.info.name):
@@ -152,7 +168,7 @@ def _publish_once(api: MapApi, followed: "FollowedMap", publisher: "MapPublisher
 
 def _follow(api: MapApi, followed: "FollowedMap", publisher: "MapPublisher", args: argparse.Namespace) -> None:
     """Publish the present state and each change, without an end but for `--changes`."""
-    heard_s, left, is_first = time.monotonic(), args.changes, True
+    heard_s, left, is_first, has_marks = time.monotonic(), args.changes, True, True
     for event in listen(api, followed.info.name):
         match event:
             case Lost():
@@ -162,18 +178,23 @@ def _follow(api: MapApi, followed: "FollowedMap", publisher: "MapPublisher", arg
                 if not event.resumed:
                     heard_s = time.monotonic()
                     followed.note_any()
+                    has_marks = True
                 for sign in event.robots:
                     publisher.publish_robot(sign.branch, sign.status)
             case CellsEvent():
                 heard_s = time.monotonic() if not followed.has_news else heard_s
                 followed.note(event)
                 continue  # `head` ends the changes of a fold
+            case MarksEvent():
+                has_marks = True
             case RobotHeard() if event.robot.gone:
                 publisher.forget_robot(event.robot.branch)
             case RobotHeard():
                 publisher.publish_robot(event.robot.branch, event.robot.status)
             case _:
                 pass
+        if has_marks:
+            has_marks = not _have_published_marks(publisher)
         # After a link that broke no news may be left but what is not published yet.
         if not (followed.has_news or publisher.is_behind or is_first):
             publisher.publish_due()
@@ -192,6 +213,16 @@ def _follow(api: MapApi, followed: "FollowedMap", publisher: "MapPublisher", arg
             left -= 1
             if left <= 0:
                 return
+
+
+def _have_published_marks(publisher: "MapPublisher") -> bool:
+    """Publish marks that changed; False if the link broke."""
+    try:
+        publisher.publish_marks()
+    except UnreachableError as exc:
+        _say_now(f"{exc.message}; trying again with the next sign of life")
+        return False
+    return True
 
 
 def _say_written(file: "McapFile") -> None:

@@ -11,7 +11,9 @@ from cairn_fusion.recording.turned_source import AXES_UP, turned_source
 
 def add_source_arguments(command: argparse.ArgumentParser, *, scale: tuple[str, ...] = ("--scale",)) -> None:
     """Add the options; `scale` are the names of the one about poses without metric scale."""
-    command.add_argument("--topics", type=Path, metavar="YAML", help="meaning of a bag's topics; see inspect")
+    command.add_argument(
+        "--topics", type=Path, metavar="YAML", help="meaning of a bag's topics; see inspect (its own topics.yaml)"
+    )
     add_frame_arguments(command)
     add_pose_arguments(command, scale=scale)
     command.add_argument(
@@ -41,12 +43,12 @@ def asked_source(path: Path, args: argparse.Namespace, *, scans_per_measurement:
     """
     # Bags and images need libraries that other commands of `cairn map` do without.
     from cairn_fusion.importers import open_source
-    from cairn_fusion.ros.topic_mapping import mapping_of
+    from cairn_fusion.ros.topic_mapping import mapping_next_to, mapping_of
 
     source = open_source(
         path,
         options=frame_options(args, path),
-        mapping=mapping_of(args.topics) if args.topics else None,
+        mapping=mapping_of(args.topics) if args.topics else mapping_next_to(path),
         frames=args.frames,
         scans_per_measurement=scans_per_measurement,
         poses=pose_options(args),

@@ -17,7 +17,6 @@ from cairn_fusion.ros.bag import Topic, Wire
 from cairn_fusion.ros.messages import plain_type
 from cairn_map.errors import DamagedDataError
 
-SUBPROTOCOLS = ("foxglove.sdk.v1", "foxglove.websocket.v1")
 TEXT_BYTES_MAX = 4 << 20
 """Largest text frame: the schemas of a thousand channels. As objects of Python it may take 20 times that."""
 CHANNELS_MAX = 10_000

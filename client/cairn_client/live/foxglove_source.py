@@ -13,15 +13,13 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
-from urllib.parse import urlsplit
+from pathlib import Path
 
-from websockets.exceptions import InvalidHandshake, InvalidMessage, InvalidURI, WebSocketException
-from websockets.sync.client import ClientConnection, connect
-from websockets.typing import Subprotocol
+from websockets.sync.client import ClientConnection
 
+from cairn_client.http.bridge_link import CONNECT_S, LINK_ERRORS, certificate_checks, connect_bridge, is_bridge_url
 from cairn_client.live.foxglove_frames import (
     CHANNELS_MAX,
-    SUBPROTOCOLS,
     Advertised,
     BridgeInfo,
     MessageData,
@@ -32,17 +30,12 @@ from cairn_client.live.foxglove_frames import (
     unsubscribe_text,
 )
 from cairn_client.live.inbox import Inbox
+from cairn_client.live.live_source import bad_url
 from cairn_fusion.ros.bag import BagMessage, Topic
 from cairn_map.errors import BadInputError, DamagedDataError
 
 log = logging.getLogger(__name__)
 
-MESSAGE_BYTES_MAX = 64 << 20
-"""Largest frame; a cloud of a million points with 48 bytes each has less."""
-FRAMES_MAX = 16
-"""Frames that the library reads ahead; beyond them the bridge drops the oldest without a word."""
-CONNECT_S = 2.5
-"""Longest wait for the bridge's answer."""
 LOOK_S = 0.1
 """Longest wait for a frame before subscriptions are looked after."""
 AGAIN_S = (0.2, 0.5, 1.0, 2.0, 5.0)
@@ -51,10 +44,6 @@ REFUSED_AGAIN_S = 0.2
 SILENT_AGAIN_S = 3.0
 """Pause after which a topic that brought nothing is subscribed again; doubled each time, up to a minute."""
 SILENT_AGAIN_MAX_S = 60.0
-BRIDGE_HELP = (
-    "start one on the robot: sudo apt install ros-$ROS_DISTRO-foxglove-bridge; "
-    "ros2 launch foxglove_bridge foxglove_bridge_launch.xml"
-)
 
 
 @dataclass(slots=True)
@@ -72,17 +61,29 @@ class _Subscription:
 class FoxgloveSource:
     """Live source behind one URL; its messages are taken by one thread."""
 
-    def __init__(self, url: str, *, inbox: Inbox | None = None, steady_s: Callable[[], float] = time.monotonic) -> None:
-        """Args: url: ws://HOST:PORT.
+    def __init__(
+        self,
+        url: str,
+        *,
+        ca_file: Path | None = None,
+        inbox: Inbox | None = None,
+        steady_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Open nothing yet.
+
+        Args:
+            url: ws://HOST:PORT or wss://HOST:PORT.
+            ca_file: issuer of the certificate of wss://, PEM; None: SSL_CERT_FILE, or those that this machine trusts.
+            inbox: takes the messages.
+            steady_s: clock.
 
         Raises:
-            BadInputError: kind `bad_url`: it is none.
+            BadInputError: kind `bad_url`: it is none; kind `no_file`: the issuer's file is none.
         """
-        if not _is_url(url):
-            raise BadInputError(
-                "bad_url", f"a live source is the URL of a Foxglove bridge, ws://HOST:PORT; got {url!r}"
-            )
+        if not is_bridge_url(url):
+            raise bad_url(url)
         self.url = url
+        self._checks = certificate_checks(url, ca_file)
         self.links = 0
         """Times that a link was made."""
         self.damaged = 0
@@ -94,11 +95,9 @@ class FoxgloveSource:
         self._lock = threading.Lock()
         self._wanted: Callable[[Topic], bool] = lambda topic: False
         self._channels: dict[int, Topic] = {}
-        self._counts: Counter[str] = Counter()
         self._subscriptions: dict[str, _Subscription] = {}
         self._by_number: dict[int, str] = {}
         self._numbers = 0
-        self._last_ns = 0
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
 
@@ -111,8 +110,7 @@ class FoxgloveSource:
     @property
     def counts(self) -> Counter[str]:
         """Messages that came, by topic."""
-        with self._lock:
-            return self._counts.copy()
+        return self._inbox.counts
 
     @property
     def dropped(self) -> Counter[str]:
@@ -147,35 +145,7 @@ class FoxgloveSource:
 
     def _connect(self, stack: ExitStack) -> ClientConnection:
         """A link that is closed with the stack."""
-        try:
-            link = stack.enter_context(
-                connect(
-                    self.url,
-                    subprotocols=[Subprotocol(name) for name in SUBPROTOCOLS],
-                    compression=None,
-                    max_size=MESSAGE_BYTES_MAX,
-                    max_queue=FRAMES_MAX,
-                    open_timeout=CONNECT_S,
-                    close_timeout=1,
-                    proxy=None,
-                )
-            )
-        except (InvalidHandshake, InvalidMessage) as exc:
-            raise BadInputError(
-                "no_foxglove", f"{self.url} answers, but is no Foxglove bridge ({exc}); {BRIDGE_HELP}"
-            ) from exc
-        except (OSError, InvalidURI, WebSocketException) as exc:
-            said = str(exc) or type(exc).__name__
-            raise BadInputError(
-                "no_bridge", f"no Foxglove bridge answers at {self.url} ({said}); {BRIDGE_HELP}"
-            ) from exc
-        if link.subprotocol not in SUBPROTOCOLS:
-            stack.close()
-            raise BadInputError(
-                "no_foxglove",
-                f"{self.url} speaks none of {', '.join(SUBPROTOCOLS)} (rosbridge is another program); {BRIDGE_HELP}",
-            )
-        return link
+        return connect_bridge(stack, self.url, self._checks)
 
     def _receive(self, stack: ExitStack, first: ClientConnection) -> None:
         """Receive until `close`, over one link after the other."""
@@ -191,7 +161,7 @@ class FoxgloveSource:
                     self._listen(link)
                 except BadInputError as exc:
                     log.debug("%s", exc.message)
-                except (OSError, WebSocketException) as exc:
+                except LINK_ERRORS as exc:
                     log.info("the link to %s is lost: %s", self.url, exc or type(exc).__name__)
                 finally:
                     self._end_link()
@@ -230,11 +200,7 @@ class FoxgloveSource:
                 if name is None:
                     return
                 self._subscriptions[name].messages += 1
-                with self._lock:
-                    self._counts[name] += 1
-                # The order of a topic's messages is that of their times, whatever the clock does.
-                self._last_ns = max(self._last_ns, time.time_ns())
-                self._inbox.put(BagMessage(name, self._last_ns, data))
+                self._inbox.receive(name, data)
             case Advertised(channels=channels):
                 with self._lock:
                     if len(self._channels.keys() | channels.keys()) > CHANNELS_MAX:
@@ -276,14 +242,3 @@ class FoxgloveSource:
             if not subscription.messages and now_s >= subscription.again_s:
                 pause_s = min(2 * subscription.pause_s, SILENT_AGAIN_MAX_S)
                 self._subscribe(link, subscription.channel, name, pause_s=pause_s)
-
-
-def _is_url(url: str) -> bool:
-    """True if this is ws://HOST:PORT, with a host and a port that there may be."""
-    try:
-        parts = urlsplit(url)
-        host, port = parts.hostname or "", parts.port
-        host.encode("idna")  # as the system's resolver will
-    except ValueError:
-        return False
-    return parts.scheme == "ws" and bool(host) and port != 0 and "\0" not in host

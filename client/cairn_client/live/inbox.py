@@ -5,6 +5,7 @@ is there, because a lost transform costs all scans around it.
 """
 
 import threading
+import time
 from collections import Counter
 from collections.abc import Callable
 
@@ -26,6 +27,8 @@ class Inbox:
         self._size_bytes = 0
         self._changed = threading.Condition()
         self._dropped: Counter[str] = Counter()
+        self._counts: Counter[str] = Counter()
+        self._last_ns = 0
         self._is_closed = False
 
     @property
@@ -33,6 +36,20 @@ class Inbox:
         """Messages that went for room, by topic."""
         with self._changed:
             return self._dropped.copy()
+
+    @property
+    def counts(self) -> Counter[str]:
+        """Messages that were received, by topic."""
+        with self._changed:
+            return self._counts.copy()
+
+    def receive(self, topic: str, data: bytes | memoryview) -> None:
+        """Add a message that comes now, and count it."""
+        with self._changed:
+            self._counts[topic] += 1
+            # The order of a topic's messages is that of their times, whatever the clock does.
+            self._last_ns = max(self._last_ns, time.time_ns())
+            self.put(BagMessage(topic, self._last_ns, data))
 
     def put(self, message: BagMessage) -> None:
         """Add a message; the oldest images go if the bytes are used up."""

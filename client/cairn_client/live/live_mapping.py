@@ -4,7 +4,7 @@
 
 A robot that is slower than its cameras takes the newest scans: those that wait longer than a second go, and are
 counted. So arrived = taken + not moved + dropped + left out by cause + waiting, at any time. Where the disk or the
-outbox is full, mapping goes on in the open measurement.
+outbox is full, mapping goes on in the open measurement. Past measurements follow a SLAM's corrections in between.
 """
 
 import logging
@@ -12,6 +12,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable
 
+from cairn_client.live.path_corrections import JumpWatch, PathCorrections
 from cairn_client.robot.robot import Robot
 from cairn_fusion.mapping.grouping import Grouping, OpenGroup
 from cairn_fusion.mapping.scan_gate import ScanGate
@@ -20,6 +21,7 @@ from cairn_fusion.ros.bag import BagMessage
 from cairn_fusion.ros.live_scans import Cause, LiveScans, ReadyScan
 from cairn_fusion.ros.scan_decoder import ScanDecoder
 from cairn_map.codec.cell_code import Profile
+from cairn_map.commits.commit import Commit
 from cairn_map.errors import BadInputError, CairnError, DamagedDataError, UnreachableError
 
 log = logging.getLogger(__name__)
@@ -46,8 +48,22 @@ class LiveMapping:
         gate: ScanGate,
         *,
         profile: Profile | None = None,
+        corrections: PathCorrections | None = None,
+        on_taken: Callable[[ReadyScan], object] = lambda ready: None,
         steady_s: Callable[[], float] = time.monotonic,
     ) -> None:
+        """Open.
+
+        Args:
+            robot: takes the scans.
+            scans: assembles them.
+            decoder: decodes them.
+            gate: says which are taken.
+            profile: coding of the commits; None: the link's.
+            corrections: moves past measurements; None: they stay, and jumps are counted all the same.
+            on_taken: called with each scan that became evidence.
+            steady_s: clock.
+        """
         self.taken = 0
         """Scans that became evidence."""
         self.dropped = 0
@@ -57,11 +73,15 @@ class LiveMapping:
         """Reason for which the last commit waits; empty: there is none."""
         self.newest_s = float("-inf")
         """Stamp of the scan taken last."""
+        self.jumps = JumpWatch(robot.replica.geometry.voxel_edge_m / 2)
+        """Jumps of the odometry in the map."""
+        self.corrections = corrections
         self._robot = robot
         self._scans = scans
         self._decoder = decoder
         self._gate = gate
         self._profile = profile
+        self._on_taken = on_taken
         self._steady_s = steady_s
         self._group = OpenGroup(Grouping())
         self._backlog: deque[ReadyScan] = deque()
@@ -102,6 +122,15 @@ class LiveMapping:
             self._map(self._backlog.popleft())
         elif self._last_scan_s is not None and now_s - self._last_scan_s > REST_S:
             self._commit()
+        self._correct(now_s)
+
+    def _correct(self, now_s: float) -> None:
+        """Take the newest path, and move one measurement at most."""
+        if self.corrections is None:
+            return
+        if self.corrections.is_due(now_s) and (path := self._scans.take_path()) is not None:
+            self.corrections.note_path(path)
+        self.corrections.step(now_s, is_idle=not self._backlog)
 
     def finish(self) -> None:
         """Map what waits, as far as a second allows, and commit; no more messages come."""
@@ -112,9 +141,14 @@ class LiveMapping:
         self.dropped += len(self._backlog)
         self._backlog.clear()
         self._commit()
+        if self.corrections is not None:
+            if (path := self._scans.take_path()) is not None:
+                self.corrections.note_path(path)
+            self.corrections.finish(lambda: self._steady_s() <= end_s)
 
     def _map(self, ready: ReadyScan) -> None:
         found = ready.found
+        self.jumps.note(found.time_s, found.T_map_rig, ready.T_map_odom)
         if not self._gate.takes(found.camera, found.time_s, found.T_map_rig):
             return
         try:
@@ -129,7 +163,7 @@ class LiveMapping:
     def _observe(self, ready: ReadyScan, scan: Scan) -> None:
         """Add a scan to the open measurement, which another epoch ends before."""
         try:
-            is_committed = self._robot.observe(scan) is not None
+            commit = self._robot.observe(scan)
         except UnreachableError as exc:
             self._keep_open(exc)
             self.dropped += 1
@@ -141,9 +175,13 @@ class LiveMapping:
             else:
                 self._leave_out(ready, exc)
             return
-        if is_committed:
+        if commit is not None:
             self.commits, self.refusal, self._open_scans = self.commits + 1, "", 0
+            self._note_commit(commit)
+        if self.corrections is not None:
+            self.corrections.note_scan(scan.time_s, scan.T_map_rig, ready.T_map_odom)
         self.taken += 1
+        self._on_taken(ready)
         self.newest_s = scan.time_s
         self._open_scans += 1
         self._last_scan_s = self._steady_s()
@@ -151,12 +189,18 @@ class LiveMapping:
     def _commit(self) -> None:
         """Commit the open measurement; where the disk or the outbox is full it stays open, and is tried again."""
         try:
-            self.commits += self._robot.commit(profile=self._profile) is not None
+            commit = self._robot.commit(profile=self._profile)
+            self.commits += commit is not None
+            self._note_commit(commit)
             self.refusal, self._open_scans, self._last_scan_s = "", 0, None
         except UnreachableError as exc:
             self._keep_open(exc)
         except BadInputError as exc:
             self._give_up(exc)
+
+    def _note_commit(self, commit: Commit | None) -> None:
+        if self.corrections is not None:
+            self.corrections.note_commit(None if commit is None else commit.id)
 
     def _leave_out(self, ready: ReadyScan, exc: CairnError) -> None:
         found = ready.found
@@ -173,6 +217,7 @@ class LiveMapping:
         """Drop the open measurement, which can be no commit: it would only grow."""
         log.error("%s; its %d scans are dropped", exc.message, self._open_scans)
         self._robot.discard()
+        self._note_commit(None)
         self.taken -= self._open_scans
         self.dropped += self._open_scans
         self.refusal, self._open_scans, self._last_scan_s = "", 0, None

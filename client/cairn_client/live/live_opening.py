@@ -6,21 +6,24 @@ All of it takes eight seconds at most; what is missing after that is named, with
 meanwhile are the first ones to be mapped.
 """
 
+import re
 import time
 from collections import Counter
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
+from cairn_calib.rig.poses import Transform
 from cairn_calib.rig.rig import Rig
-from cairn_client.live.foxglove_source import FoxgloveSource
 from cairn_client.live.inbox import Inbox
+from cairn_client.live.live_source import LiveSource
 from cairn_fusion.ros.bag import BagMessage, Topic
 from cairn_fusion.ros.bag_index import BagIndex, TopicIndex, add_message, wire_of
 from cairn_fusion.ros.bag_recording import Survey, image_topics, images_of, rig_of
-from cairn_fusion.ros.live_frames import LiveFrames
 from cairn_fusion.ros.live_scans import LiveScans
-from cairn_fusion.ros.messages import CAMERA_INFO, ODOMETRY, POSES, TRANSFORMS
+from cairn_fusion.ros.messages import CAMERA_INFO, ODOMETRY, PATH, POSES, TRANSFORMS, RosTransform
 from cairn_fusion.ros.tf_tree import FrameTree
 from cairn_fusion.ros.topic_mapping import BagMapping
 from cairn_fusion.ros.topic_proposal import propose
@@ -40,6 +43,12 @@ class OpenedLive:
     rig: Rig
     scans: LiveScans
     topics: dict[str, Topic]
+    T_path_rig: Transform
+    """Pose of the rig in the frame of the body whose poses the corrections are."""
+    fixed: tuple[RosTransform, ...]
+    """Poses between the base and what is fixed on it, of which the rig is built."""
+    infos: tuple[BagMessage, ...]
+    """The CameraInfo of which the rig is built."""
     early: list[BagMessage]
     """Messages that came while it was opened."""
     dropped: Counter[str]
@@ -47,7 +56,7 @@ class OpenedLive:
 
 
 def open_live(
-    source: FoxgloveSource,
+    source: LiveSource,
     mapping: BagMapping,
     *,
     within_s: float = OPEN_S,
@@ -60,7 +69,7 @@ def open_live(
         BadInputError: no bridge, a topic is missing, silent, or of another type, or no rig can be made of it.
     """
     end_s = steady_s() + within_s
-    named = {**dict.fromkeys(mapping.topics()), mapping.poses.topic: None}
+    named = named_topics(mapping)
 
     def is_wanted(topic: Topic) -> bool:
         """True of the mapping's topics and of all transforms that can be read."""
@@ -74,7 +83,7 @@ def open_live(
     _check_topics(source.url, mapping, topics, offered=source.topics.keys())
     # Stage 2: the rig, from the first message of each topic and all transforms so far.
     index = BagIndex({name: TopicIndex(topic) for name, topic in topics.items()}, FrameTree(source.url), {})
-    early = Inbox(bytes_max=early_bytes_max)
+    early, infos = Inbox(bytes_max=early_bytes_max), dict[str, BagMessage]()
     while True:
         for message in source.take(within_s=LOOK_S):
             # A node that started meanwhile may offer transforms, too; one that is gone again counts no more.
@@ -84,20 +93,30 @@ def open_live(
                     continue
                 topics[topic.name], index.topics[topic.name] = topic, TopicIndex(topic)
             early.put(message)
+            if topics[message.topic].type == CAMERA_INFO:
+                infos.setdefault(message.topic, message)
             _add(index, message, source.url)
         try:
-            rig = _rig_of(index, mapping)
+            rig, T_path_rig = _rig_of(index, mapping), _T_path_rig(index.tree, mapping)
             break
         except BadInputError as exc:
             if steady_s() >= end_s:
                 raise _still_missing(exc, index, source, within_s) from exc
     scans = LiveScans(mapping.name, mapping, topics)
-    _hold_cameras(scans.frames, index.tree, mapping, index)
-    return OpenedLive(rig, scans, topics, early.take(within_s=0.0), early.dropped)
+    fixed = _fixed_edges(index, mapping)
+    scans.frames.hold([edge.child for edge in fixed], index.tree)
+    waiting = early.take(within_s=0.0)
+    return OpenedLive(rig, scans, topics, T_path_rig, fixed, tuple(infos.values()), waiting, early.dropped)
+
+
+def named_topics(mapping: BagMapping) -> dict[str, str]:
+    """Topics that a mapping needs, each with its purpose."""
+    named = {**mapping.topics(), mapping.poses.topic: "poses"}
+    return named if mapping.corrections is None else {**named, mapping.corrections.topic: "corrections"}
 
 
 def survey_live(
-    source: FoxgloveSource,
+    source: LiveSource,
     *,
     seconds: float,
     on_message: Callable[[], object],
@@ -123,7 +142,7 @@ def survey_live(
     for name, topic in source.topics.items():
         index.topics.setdefault(name, TopicIndex(topic))
     ordered = BagIndex(dict(sorted(index.topics.items())), index.tree, index.tracks)
-    name = source.url.partition("://")[2].replace(":", "-").strip("/")
+    name = re.sub(r"[^\w.]+", "-", source.url.partition(":")[2]).strip("-") or "robot"
     return Survey(Path(name), ordered, propose(ordered, Path(name), command=f"cairn robot live {source.url}"))
 
 
@@ -141,8 +160,7 @@ def _check_topics(url: str, mapping: BagMapping, topics: dict[str, Topic], *, of
     Raises:
         BadInputError: kind `no_topic`, `wrong_topic` or `unknown_encoding`.
     """
-    purposes = {**mapping.topics(), mapping.poses.topic: "poses"}
-    missing = [f"{name} ({what})" for name, what in purposes.items() if name not in topics]
+    missing = [f"{name} ({what})" for name, what in named_topics(mapping).items() if name not in topics]
     if missing:
         raise BadInputError(
             "no_topic",
@@ -152,6 +170,8 @@ def _check_topics(url: str, mapping: BagMapping, topics: dict[str, Topic], *, of
     wanted = [(topic, f"camera {camera}", types) for topic, camera, types in image_topics(mapping)]
     wanted += [(c.info, f"camera {name}", (CAMERA_INFO,)) for name, c in mapping.cameras.items() if c.info is not None]
     wanted.append((mapping.poses.topic, "poses", (*sorted(TRANSFORMS), ODOMETRY, *sorted(POSES))))
+    if mapping.corrections is not None:
+        wanted.append((mapping.corrections.topic, "corrections", (PATH,)))
     for name, what, types in wanted:
         if topics[name].type not in types:
             raise BadInputError(
@@ -165,7 +185,7 @@ def _rig_of(index: BagIndex, mapping: BagMapping) -> Rig:
     return rig_of(index, mapping, found)
 
 
-def _still_missing(exc: BadInputError, index: BagIndex, source: FoxgloveSource, within_s: float) -> BadInputError:
+def _still_missing(exc: BadInputError, index: BagIndex, source: LiveSource, within_s: float) -> BadInputError:
     """The error of a source that does not bring what a rig is built from."""
     silent = sorted(name for name, entry in index.topics.items() if not len(entry))
     if exc.kind == "no_messages" and silent:
@@ -177,12 +197,29 @@ def _still_missing(exc: BadInputError, index: BagIndex, source: FoxgloveSource, 
     return BadInputError(exc.kind, f"{exc.message} (after {within_s:g} s at {source.url})")
 
 
-def _hold_cameras(frames: LiveFrames, tree: FrameTree, mapping: BagMapping, index: BagIndex) -> None:
-    """Hold the edges between the base and its cameras, of which the rig is built."""
-    children: set[str] = set()
-    for camera in mapping.cameras.values():
-        if camera.T_base_camera is None:
-            above_base = tree.way_up(mapping.frames.base)
-            above_camera = tree.way_up(camera.frame or index.topics[camera.topic].frame)
-            children |= set(above_base).symmetric_difference(above_camera)
-    frames.hold(children, tree)
+def _T_path_rig(tree: FrameTree, mapping: BagMapping) -> Transform:
+    """Pose of the rig, which is the base, on the body of the corrections.
+
+    Raises:
+        BadInputError: kind `bad_frames` or `no_transform`: they are not rigid to each other.
+    """
+    frame = None if mapping.corrections is None else mapping.corrections.frame
+    return np.eye(4) if frame is None else tree.fixed_pose(frame, mapping.frames.base)
+
+
+def _fixed_edges(index: BagIndex, mapping: BagMapping) -> tuple[RosTransform, ...]:
+    """Poses between the base and its cameras, and the body of the topic of poses."""
+    tree = index.tree
+    frames = [
+        camera.frame or index.topics[camera.topic].frame
+        for camera in mapping.cameras.values()
+        if camera.T_base_camera is None
+    ]
+    if mapping.poses.topic in index.tracks:
+        frames += index.tracks[mapping.poses.topic].edges.keys() & tree.frames()
+    above_base = set(tree.way_up(mapping.frames.base))
+    children = {child for frame in frames for child in above_base.symmetric_difference(tree.way_up(frame))}
+    edges = {child: tree.edges[child] for child in sorted(children & tree.edges.keys())}
+    return tuple(
+        RosTransform(edge.poses[0], edge.parent, child, np.array(edge.poses[1:8])) for child, edge in edges.items()
+    )

@@ -6,12 +6,13 @@ from dataclasses import dataclass, field
 
 from pydantic import BaseModel, ConfigDict
 
-from cairn_client.live.foxglove_source import FoxgloveSource
 from cairn_client.live.live_mapping import LiveMapping
+from cairn_client.live.live_source import LiveSource
+from cairn_client.live.scan_recorder import ScanRecorder
 from cairn_fusion.ros.bag import Topic
 from cairn_fusion.ros.bag_index import STATIC_NAME
 from cairn_fusion.ros.live_scans import LiveScans
-from cairn_fusion.ros.messages import CAMERA_INFO, TRANSFORMS
+from cairn_fusion.ros.messages import CAMERA_INFO, PATH, TRANSFORMS
 
 SPAN_S = 5.0
 """Span of time over which rates are counted."""
@@ -19,8 +20,15 @@ SILENT_S = 5.0
 """Silence of a topic from which on it is named."""
 CLOCK_S = 2.0
 """Difference between two clocks from which on it is named."""
+PATH_S = 60.0
+"""Time after a path's last pose from which on a jump lacks a path."""
 SIMULATED_S = 1e8
 """Stamps before 1973 are those of a simulation's clock."""
+
+
+def shown_times(count: int) -> str:
+    """A number of times in words."""
+    return "once" if count == 1 else f"{count} times"
 
 
 class TopicStatus(BaseModel):
@@ -36,7 +44,7 @@ class TopicStatus(BaseModel):
     is_offered: bool
     """True if a publisher is there now, as far as the bridge says."""
     dropped: int
-    """Messages that went for room before they were read."""
+    """Messages that went for room before they were read, or that the network lost as far as the door numbers them."""
 
 
 class LiveStatus(BaseModel):
@@ -71,6 +79,11 @@ class LiveStatus(BaseModel):
     commits: int
     commits_waiting: int
     """Commits that the server has not acknowledged."""
+    amended: int
+    """Measurements moved to corrected poses, each as often as it was."""
+    amends_waiting: int
+    jumps: int
+    """Times that the odometry's frame moved in the map by more than half a voxel, at the robot."""
     links: int
     """Times that the bridge was connected."""
     no_link_s: float | None
@@ -96,7 +109,7 @@ class StatusWatch:
     """Watch over one live mapping: counts of the last seconds, for rates."""
 
     robot: str
-    source: FoxgloveSource
+    source: LiveSource
     scans: LiveScans
     mapping: LiveMapping
     topics: dict[str, Topic]
@@ -104,6 +117,7 @@ class StatusWatch:
     """Steady time of the start."""
     early_dropped: Counter[str] = field(default_factory=Counter)
     """Messages that went for room while the source was opened, by topic."""
+    recorder: ScanRecorder | None = None
     _before: deque[_Counts] = field(default_factory=deque)
     _last: dict[str, tuple[int, float]] = field(default_factory=dict)
     """Count of each topic's messages, and the steady time at which that count was first seen."""
@@ -140,7 +154,7 @@ class StatusWatch:
             self._topic(name, counts[name], now_s, rate, is_offered=name in offered, dropped=dropped[name])
             for name, rate in rates_hz.items()
         ]
-        lost_s = self.source.lost_since_s
+        lost_s, corrections = self.source.lost_since_s, self.mapping.corrections
         return LiveStatus(
             robot=self.robot,
             running_s=now_s - self.start_s,
@@ -158,6 +172,9 @@ class StatusWatch:
             clock_apart_s=lead_s,
             commits=self.mapping.commits,
             commits_waiting=commits_waiting,
+            amended=0 if corrections is None else corrections.amended,
+            amends_waiting=0 if corrections is None else corrections.waiting,
+            jumps=self.mapping.jumps.count,
             links=self.source.links,
             no_link_s=None if lost_s is None else now_s - lost_s,
             missing=self._missing(topics, lead_s, None if lost_s is None else now_s - lost_s),
@@ -195,7 +212,8 @@ class StatusWatch:
         said = []
         for status in topics:
             kind = self.topics[status.topic].type
-            is_latched = kind == CAMERA_INFO or (kind in TRANSFORMS and STATIC_NAME in status.topic)
+            # A path comes when the SLAM has a new pose, perhaps never for a robot at rest.
+            is_latched = kind in (CAMERA_INFO, PATH) or (kind in TRANSFORMS and STATIC_NAME in status.topic)
             if not status.is_offered:
                 said.append(f"{status.topic}: no publisher")
             elif not is_latched and status.silent_s > SILENT_S:
@@ -206,6 +224,19 @@ class StatusWatch:
             said.append(f"clock apart {lead_s:.0f} s: this machine's and the robot's differ")
         if self.scans.frame_error:
             said.append(self.scans.frame_error)
-        if self.mapping.refusal:
-            said.append(self.mapping.refusal)
-        return said
+        said += [text for text in (self.mapping.refusal, self.recorder.refusal if self.recorder else "") if text]
+        return [*said, *self._uncorrected()]
+
+    def _uncorrected(self) -> list[str]:
+        """Sentences about jumps of the odometry in the map that no path followed."""
+        jumps, corrections = self.mapping.jumps, self.mapping.corrections
+        if corrections is not None and corrections.refusal:
+            return [corrections.refusal]
+        if not jumps.count or (corrections is not None and corrections.newest_s > jumps.last_s - PATH_S):
+            return []
+        said = f"odometry jumped in the map {shown_times(jumps.count)}, by up to {jumps.largest_m:.2f} m, and "
+        if corrections is None:
+            return [
+                f"{said}what was mapped before stays: name the SLAM's optimised path as corrections in the topics file"
+            ]
+        return [f"{said}no path came since"]

@@ -23,12 +23,12 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import Server, ServerConnection, serve
 from websockets.typing import Origin, Subprotocol
 
+from cairn_client.http.bridge_link import SUBPROTOCOLS
 from cairn_fusion.ros.map_messages import MapMessage, definition_of
 from cairn_map.errors import BadInputError
 
 log = logging.getLogger(__name__)
 
-SUBPROTOCOLS = [Subprotocol("foxglove.sdk.v1"), Subprotocol("foxglove.websocket.v1")]
 """The newer and the older name; the messages that are sent here are the same."""
 ORIGINS = (None, Origin("file://"), Origin("https://app.foxglove.dev"))
 """Programs, the desktop viewers, which are pages of files, and Foxglove's page; `null` is any page in a frame."""
@@ -252,7 +252,7 @@ def _listening(handler: Any, host: str, port: int, origins: Sequence[str]) -> Se
             port,
             family=socket.AF_INET6 if ":" in host else socket.AF_INET,
             origins=[*ORIGINS, *map(Origin, origins)],
-            subprotocols=SUBPROTOCOLS,
+            subprotocols=[Subprotocol(name) for name in SUBPROTOCOLS],
             compression=None,  # a cloud of megabytes would take longer to pack than to send
             max_size=REQUEST_BYTES_MAX,
             logger=_silence(),

@@ -6,6 +6,7 @@ Topics:
 /cairn/points               sensor_msgs/PointCloud2: all occupied voxels, at most every 10 s
 /cairn/changed_points       sensor_msgs/PointCloud2: those of the cells that changed
 /cairn/hot_spots            visualization_msgs/MarkerArray: the hottest places
+/cairn/marks                visualization_msgs/MarkerArray: what robots and people marked, after each change
 /cairn/octomap              octomap_msgs/Octomap: occupied and free space, once, where it is asked for
 /tf                         tf2_msgs/TFMessage: where robots are, each the frame of its name
 /cairn/robots/NAME/path     nav_msgs/Path: the way of one since publishing began, a pose every 5 cm, at most every 3 s
@@ -15,9 +16,11 @@ import math
 import time
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import Protocol
 
 from cairn_client.http.api import MapApi
+from cairn_client.http.mark_pages import mark_pages
 from cairn_client.publish.followed_map import FollowedMap
 from cairn_fusion.ros.map_messages import (
     TIME_S_MAX,
@@ -27,6 +30,7 @@ from cairn_fusion.ros.map_messages import (
     cloud_message,
     grid_message,
     hot_spots_message,
+    marks_message,
     octomap_message,
     path_message,
     transforms_message,
@@ -36,6 +40,7 @@ from cairn_map.evidence.grid import CellKey
 from cairn_map.evidence.voxels import Voxels, joined_voxels, voxels_of_evidence
 from cairn_map.queries.floor_grid import Band, FloorGrid
 from cairn_map.queries.map_snapshot import MapSnapshot
+from cairn_map.wire.mark_messages import MarkEntry
 from cairn_map.wire.messages import RobotStatus
 
 HOT_SPOTS = 10
@@ -48,6 +53,10 @@ STEP_M = 0.05
 POSES_MAX = 2000
 """Poses of a path, even; one that grows longer keeps every second pose, and goes on with steps of twice the length."""
 ROBOTS_MAX = 1000
+MARKS_MAX = 2000
+"""Marks in one message, the newest; each takes two markers of some 300 bytes."""
+MARK_PAGES_MAX = 200
+"""Most pages that are taken at a time; the next change goes on."""
 TREE_BYTES_MAX = 256 << 20
 STOREY_RATIO = 2.0
 """Free area of a storey that is published in another one's place, as a multiple of that one's: tables come and go."""
@@ -97,6 +106,10 @@ class MapPublisher:
         self._whole_due_s = -math.inf
         self._is_whole_new = False
         self._ways: dict[str, _Way] = {}
+        self._marks: dict[str, MarkEntry] = {}
+        """Marks of the map by key, oldest first."""
+        self._marks_sent: set[str] = set()
+        self._marks_cursor: str | None = None
 
     @property
     def is_behind(self) -> bool:
@@ -145,6 +158,23 @@ class MapPublisher:
         tree = b"".join(self._api.stream(path, at_most_bytes=TREE_BYTES_MAX))
         edge_m = self._followed.info.geometry.voxel_edge_m
         self._send(octomap_message("/cairn/octomap", tree, edge_m, self._choice.frame, time.time_ns()))
+
+    def publish_marks(self) -> None:
+        """Publish the map's marks, if some came or went; none of a server that knows of none."""
+        pages = mark_pages(self._api, self._followed.info.name, after=self._marks_cursor)
+        try:
+            for page in islice(pages, MARK_PAGES_MAX):
+                gone = set(page.removed)
+                kept = {} if page.from_start else self._marks
+                self._marks = {key: entry for key, entry in kept.items() if key.partition(":")[0] not in gone}
+                self._marks |= {entry.key: entry for entry in page.marks}
+                self._marks_cursor = page.cursor
+        except NotFoundError:
+            return
+        if self._marks.keys() != self._marks_sent:
+            self._marks_sent = set(self._marks)
+            newest = [entry.mark for entry in self._marks.values()][-MARKS_MAX:]
+            self._send(marks_message("/cairn/marks", newest, self._choice.frame, time.time_ns()))
 
     def publish_robot(self, name: str, status: RobotStatus | None) -> None:
         """Publish where a robot says it is, and its way so far; nothing at a time that no message of ROS 2 can hold."""

@@ -13,17 +13,30 @@ from collections import Counter, deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
+from itertools import takewhile
 
 import numpy as np
 
+from cairn_calib.rig.poses import Transform
 from cairn_calib.rig.rig import Spectrum
 from cairn_fusion.recording.timed_lists import TimedList
 from cairn_fusion.ros.bag import HELD_BYTES, BagMessage, Topic
 from cairn_fusion.ros.bag_index import BASE, STATIC_NAME, BagIndex, TopicIndex, translate_message_damage, wire_of
 from cairn_fusion.ros.bag_scans import BagScan, PoseAt, images_near, poses_of
 from cairn_fusion.ros.live_frames import WINDOW_S, LiveFrames
-from cairn_fusion.ros.messages import ODOMETRY, POSES, TRANSFORMS, RosTransform, read_header, read_pose, read_transforms
+from cairn_fusion.ros.messages import (
+    ODOMETRY,
+    POSES,
+    TRANSFORMS,
+    RosPath,
+    RosTransform,
+    read_header,
+    read_path,
+    read_pose,
+    read_transforms,
+)
 from cairn_fusion.ros.scan_decoder import is_loose
+from cairn_fusion.ros.tf_tree import FrameTree
 from cairn_fusion.ros.topic_mapping import BagMapping, MappedCamera
 from cairn_map.errors import BadInputError, DamagedDataError
 
@@ -36,6 +49,10 @@ IMAGE_BYTES_MAX = 256_000_000
 """Most bytes of images that wait for a decision; beyond it the oldest go, of the topic that holds most."""
 OTHERS_S = 2.0
 """Age at which an image that no range image needed is forgotten, behind the newest of its topic."""
+
+
+Edges = tuple[tuple[RosTransform, bool], ...]
+"""Poses, each with True if it holds at all times."""
 
 
 class Cause(StrEnum):
@@ -64,6 +81,10 @@ class ReadyScan:
     pose_at: PoseAt
     """Way of the robot around the scan."""
     arrived_s: float
+    T_map_odom: Transform
+    """Pose in the map of the frame in which the base never jumps; the unit matrix where none is known."""
+    edges: Edges
+    """Poses that its own is computed from, of tf or of the topic of poses."""
 
 
 @dataclass(slots=True)
@@ -125,6 +146,17 @@ class _Pending:
     arrived_s: float
 
 
+@dataclass(frozen=True, slots=True)
+class _Way:
+    """Way of the robot around the time of a range image."""
+
+    pose_at: PoseAt
+    first_s: float
+    last_s: float
+    T_map_odom: Transform
+    edges: Edges
+
+
 class LiveScans:
     """Assembler of one robot's scans; by one thread."""
 
@@ -151,6 +183,7 @@ class LiveScans:
         """Newest reason for which a transform was not taken, or no way leads to the map; empty: there is none."""
         self.last_s = -np.inf
         """Stamp of the range image that came last; a newest one would stay at one wrong stamp of the future."""
+        self._path: BagMessage | None = None
         self._source = source
         self._mapping = mapping
         self._topics = dict(topics)
@@ -172,6 +205,19 @@ class LiveScans:
     def held_bytes(self) -> int:
         """Memory of the images that wait, bytes."""
         return sum(images.size_bytes for images in self._images.values())
+
+    def take_path(self) -> RosPath | None:
+        """The newest path of the topic of corrections that can be read, once; None: there is no new one."""
+        # Read here, not when it comes: a path of a day takes a second, and each keyframe publishes it again.
+        message, self._path = self._path, None
+        if message is None:
+            return None
+        try:
+            with translate_message_damage(self._source, message), np.errstate(all="ignore"):
+                return read_path(message.data, wire_of(self._topics[message.topic]))
+        except DamagedDataError:
+            self.damaged += 1
+            return None
 
     def add(self, message: BagMessage, now_s: float) -> None:
         """Add a message of one of the topics; one that cannot be read is counted.
@@ -210,6 +256,8 @@ class LiveScans:
             self._add_pose(self._track, named, is_static=False)
         elif topic.name in self._images:
             self._add_image(message, topic, read_header(message.data, wire).time_s, now_s)
+        elif self._mapping.corrections is not None and topic.name == self._mapping.corrections.topic:
+            self._path = message
 
     def _add_pose(self, frames: LiveFrames, found: RosTransform, *, is_static: bool) -> None:
         try:
@@ -296,9 +344,7 @@ class LiveScans:
                 return False
         return True
 
-    def _way(
-        self, camera: MappedCamera, time_s: float, *, is_overdue: bool
-    ) -> tuple[PoseAt, float, float] | Cause | None:
+    def _way(self, camera: MappedCamera, time_s: float, *, is_overdue: bool) -> _Way | Cause | None:
         """The way of the robot around a time; None: more may come; a cause: it comes too late."""
         reach_s = SWEEP_S if is_loose(camera) else 0.0
         span = time_s - reach_s, time_s + reach_s
@@ -317,21 +363,50 @@ class LiveScans:
             return (Cause.NO_TF if time_s < first_s else Cause.TF_LATE) if is_overdue else None
         try:
             pose_at(time_s)
+            T_map_odom = self._T_map_odom(index.tree, time_s)
         except BadInputError as exc:
             self.frame_error = exc.message
             return Cause.TF_GAP if is_overdue else None
         self.frame_error = ""
-        return pose_at, first_s, last_s
+        return _Way(pose_at, first_s, last_s, T_map_odom, tuple(self._edges(index.tree, span)))
 
-    def _scan(self, pending: _Pending, camera: MappedCamera, way: tuple[PoseAt, float, float]) -> ReadyScan:
-        pose_at, first_s, last_s = way
+    def _edges(self, tree: FrameTree, span: tuple[float, float]) -> Iterator[tuple[RosTransform, bool]]:
+        """Poses around a span of time on the way from the base to the map."""
+        if self._topics[self._mapping.poses.topic].type not in TRANSFORMS:
+            edges = list(self._track.edges.values())
+        else:
+            ways = tree.way_up(self._mapping.frames.base), tree.way_up(self._mapping.frames.map)
+            children = set(ways[0]).symmetric_difference(ways[1]) & self.frames.edges.keys()
+            edges = [self.frames.edges[child] for child in sorted(children)]
+        for edge in edges:
+            yield from ((found, edge.is_static) for found in edge.between(*span))
+
+    def _T_map_odom(self, tree: FrameTree, time_s: float) -> Transform:
+        """Pose of the odometry's frame at a time at which the base has one; the unit matrix without such a frame."""
+        frames, poses = self._mapping.frames, self._mapping.poses
+        if self._topics[poses.topic].type not in TRANSFORMS:
+            return np.eye(4)
+        way = list(takewhile(lambda frame: frame != frames.map, tree.way_up(frames.base)))
+        if frames.odom not in way:
+            return np.eye(4)
+        return tree.pose_at(frames.map, frames.odom, time_s, max_gap_s=poses.max_gap_s)
+
+    def _scan(self, pending: _Pending, camera: MappedCamera, way: _Way) -> ReadyScan:
+        pose_at, first_s, last_s = way.pose_at, way.first_s, way.last_s
         lists = {topic: self._images[topic].timed() for topic in (camera.topic, *self._others(camera))}
         numbers = images_near(self._mapping, camera, lists, pending.time_s)
         self.alone += len(numbers) < len(lists)
         messages = {topic: self._images[topic].messages[n] for topic, n in numbers.items()}
         self._images[camera.topic].forget(pending.time_s)
         found = BagScan(time_s=pending.time_s, T_map_rig=pose_at(pending.time_s), camera=pending.camera, images=numbers)
-        return ReadyScan(found, messages, lambda time_s: pose_at(min(max(time_s, first_s), last_s)), pending.arrived_s)
+        return ReadyScan(
+            found,
+            messages,
+            lambda time_s: pose_at(min(max(time_s, first_s), last_s)),
+            pending.arrived_s,
+            way.T_map_odom,
+            way.edges,
+        )
 
     def _leave_out(self, pending: _Pending, cause: Cause) -> None:
         """Drop a range image that waits, and count it."""

@@ -1,23 +1,28 @@
-"""Readings of a map as messages of ROS 2, for bags, Foxglove and RViz.
+"""Readings of a map, and a robot's own poses, as messages of ROS 2, for bags, Foxglove and RViz.
 
     nav_msgs/OccupancyGrid            a storey's floor
     sensor_msgs/PointCloud2           occupied voxels: x y z rgb probability temperature
     tf2_msgs/TFMessage, nav_msgs/Path where robots are and were
-    visualization_msgs/MarkerArray    hot spots
+    visualization_msgs/MarkerArray    hot spots, marks
     octomap_msgs/Octomap              occupied and free space
+    nav_msgs/Odometry, PoseStamped    poses as they came from a robot, bit for bit
 
 The bytes are CDR as `rosbags` writes it, by the definitions of ROS 2 Humble, which later distributions share.
 Lengths are metres, temperatures degrees Celsius (REP 103), NaN where there is none.
 """
 
+import math
 from collections.abc import Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from cairn_fusion.ros.bag import Wire
+from cairn_fusion.ros.messages import RosTransform
+from cairn_map.commits.mark import Mark
 from cairn_map.errors import DamagedDataError
 from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.voxels import Voxels
@@ -27,6 +32,8 @@ GRID = "nav_msgs/msg/OccupancyGrid"
 CLOUD = "sensor_msgs/msg/PointCloud2"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 PATH = "nav_msgs/msg/Path"
+POSE = "geometry_msgs/msg/PoseStamped"
+ODOMETRY = "nav_msgs/msg/Odometry"
 MARKERS = "visualization_msgs/msg/MarkerArray"
 OCTOMAP = "octomap_msgs/msg/Octomap"
 OCTOMAP_FIELDS = "std_msgs/Header header\nbool binary\nstring id\nfloat64 resolution\nint8[] data\n"
@@ -34,13 +41,17 @@ OCTOMAP_FIELDS = "std_msgs/Header header\nbool binary\nstring id\nfloat64 resolu
 POINT = np.dtype([(name, "<f4") for name in ("x", "y", "z", "rgb", "probability", "temperature")])
 FLOAT32 = 7
 """`PointField.FLOAT32`."""
-SPHERE, TEXT, DELETE_ALL = 2, 9, 3
-"""Two types and an action of `visualization_msgs/Marker`."""
+CUBE, SPHERE, TEXT, DELETE_ALL = 1, 2, 9, 3
+"""Three types and an action of `visualization_msgs/Marker`."""
 ZERO_CELSIUS_K = 273.15
 UNCOLOURED = 0x808080
 """Grey, for voxels that no colour camera saw."""
 SPOT_M = 0.15
-"""Diameter of a hot spot's marker, and height of its text."""
+"""Diameter of the marker of a point, and height of a text."""
+THIN_M = 0.01
+"""Least edge of a box's marker: viewers draw none without."""
+HOT, MARKED = (1.0, 0.25, 0.0, 0.8), (0.1, 0.5, 1.0, 0.5)
+"""Colours of markers: red, green, blue, opacity."""
 TIME_S_MAX = 2**31 - 1
 """Latest time of a message, UTC seconds since 1970: `builtin_interfaces/Time` has 32 bits with a sign."""
 TREE_DATA = b"\ndata\n"
@@ -84,9 +95,11 @@ def _store() -> Any:
 
 
 @lru_cache
-def definition_of(type_name: str) -> str:
+def definition_of(type_name: str, wire: Wire = Wire.CDR) -> str:
     """Definition of a type and of all that it holds, in the form of `.msg` files."""
-    text: str = _store().generate_msgdef(type_name, ros_version=2)[0]
+    is_ros1 = wire is Wire.ROS1
+    store = get_typestore(Stores.ROS1_NOETIC) if is_ros1 else _store()
+    text: str = store.generate_msgdef(type_name, ros_version=1 if is_ros1 else 2)[0]
     return text
 
 
@@ -150,6 +163,50 @@ def transforms_message(topic: str, poses: dict[str, RobotPose], frame: str, time
     return _written(topic, TRANSFORMS, _made(TRANSFORMS, transforms=edges), time_ns)
 
 
+def edges_message(topic: str, edges: Sequence[RosTransform], time_ns: int) -> MapMessage:
+    """Transforms as they came from a robot: `read_transforms` reads the same numbers."""
+    stamped = [
+        _made(
+            "geometry_msgs/msg/TransformStamped",
+            header=_header(edge.parent, exact_ns(edge.time_s)),
+            child_frame_id=edge.child,
+            transform=_made(
+                "geometry_msgs/msg/Transform",
+                translation=_made("geometry_msgs/msg/Vector3", **_xyz(edge.pose[:3].tolist())),
+                rotation=_quaternion(edge.pose[3:].tolist()),
+            ),
+        )
+        for edge in edges
+    ]
+    return _written(topic, TRANSFORMS, _made(TRANSFORMS, transforms=stamped), time_ns)
+
+
+def pose_message(topic: str, pose: RosTransform, *, is_odometry: bool, time_ns: int) -> MapMessage:
+    """A pose as it came from a robot, as `Odometry` or `PoseStamped`: `read_pose` reads the same numbers."""
+    header = _header(pose.parent, exact_ns(pose.time_s))
+    place = _pose(pose.pose[:3].tolist(), pose.pose[3:].tolist())
+    if not is_odometry:
+        return _written(topic, POSE, _made(POSE, header=header, pose=place), time_ns)
+    still = _made("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
+    twist = _made("geometry_msgs/msg/Twist", linear=still, angular=still)
+    message = _made(
+        ODOMETRY,
+        header=header,
+        child_frame_id=pose.child,
+        pose=_made("geometry_msgs/msg/PoseWithCovariance", pose=place, covariance=np.zeros(36)),
+        twist=_made("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=np.zeros(36)),
+    )
+    return _written(topic, ODOMETRY, message, time_ns)
+
+
+def exact_ns(time_s: float) -> int:
+    """Nanoseconds of a header's time, of which `header_of` makes the same float again, 0.2 us from the next one."""
+    near = time_s * 1e9
+    # As `header_of` divides: the nanoseconds as a float, of which several are next to each other here.
+    floats = [near, *(math.nextafter(near, end) for end in (-math.inf, math.inf))]
+    return next((int(ns) for ns in floats if ns / 1e9 == time_s), round(near))
+
+
 def path_message(topic: str, poses: Sequence[RobotPose], frame: str, time_ns: int) -> MapMessage:
     """A robot's way, oldest pose first."""
     stamped = [
@@ -171,6 +228,20 @@ def hot_spots_message(topic: str, spots: Sequence[HotSpot], frame: str, time_ns:
         text = f"{spot.kelvin - ZERO_CELSIUS_K:.1f} \N{DEGREE SIGN}C"
         markers.append(_marker(frame, time_ns, number=2 * n, kind=SPHERE, place=(x, y, z)))
         markers.append(_marker(frame, time_ns, number=2 * n + 1, kind=TEXT, place=(x, y, z + SPOT_M), text=text))
+    return _written(topic, MARKERS, _made(MARKERS, markers=markers), time_ns)
+
+
+def marks_message(topic: str, marks: Sequence[Mark], frame: str, time_ns: int) -> MapMessage:
+    """A box or a sphere, and its name, for each mark; they replace all that were sent before."""
+    made = partial(_marker, frame, time_ns, space="marks", colour=MARKED)
+    markers = [made(action=DELETE_ALL)]
+    for n, mark in enumerate(marks):
+        x, y, z = (mm / 1000 for mm in mark.place_mm)
+        is_box = any(mark.extent_mm)
+        size_m = [max(mm / 1000, THIN_M) for mm in mark.extent_mm] if is_box else [SPOT_M] * 3
+        above = (x, y, z + size_m[2] / 2 + SPOT_M)
+        markers.append(made(number=2 * n, kind=CUBE if is_box else SPHERE, place=(x, y, z), size_m=size_m))
+        markers.append(made(number=2 * n + 1, kind=TEXT, place=above, text=f"{mark.name} ({mark.kind})"))
     return _written(topic, MARKERS, _made(MARKERS, markers=markers), time_ns)
 
 
@@ -247,18 +318,21 @@ def _marker(
     action: int = 0,
     place: Sequence[float] = (0.0, 0.0, 0.0),
     text: str = "",
+    space: str = "hot_spots",
+    size_m: Sequence[float] = (SPOT_M, SPOT_M, SPOT_M),
+    colour: Sequence[float] = HOT,
 ) -> Any:
     empty_image = _made("sensor_msgs/msg/CompressedImage", header=_header("", 0), format="", data=np.empty(0, np.uint8))
     return _made(
         "visualization_msgs/msg/Marker",
         header=_header(frame, time_ns),
-        ns="hot_spots",
+        ns=space,
         id=number,
         type=kind,
         action=action,
         pose=_pose(place, (0.0, 0.0, 0.0, 1.0)),
-        scale=_made("geometry_msgs/msg/Vector3", x=SPOT_M, y=SPOT_M, z=SPOT_M),
-        color=_made("std_msgs/msg/ColorRGBA", r=1.0, g=0.25, b=0.0, a=0.8),
+        scale=_made("geometry_msgs/msg/Vector3", **_xyz(size_m)),
+        color=_made("std_msgs/msg/ColorRGBA", **dict(zip("rgba", colour, strict=True))),
         lifetime=_made("builtin_interfaces/msg/Duration", sec=0, nanosec=0),
         frame_locked=False,
         points=[],

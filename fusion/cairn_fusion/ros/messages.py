@@ -27,11 +27,16 @@ CAMERA_INFO = "sensor_msgs/CameraInfo"
 TRANSFORMS = frozenset(["tf2_msgs/TFMessage", "tf/tfMessage"])
 ODOMETRY = "nav_msgs/Odometry"
 POSES = frozenset(["geometry_msgs/PoseStamped", "geometry_msgs/PoseWithCovarianceStamped"])
+PATH = "nav_msgs/Path"
 POINTS = "sensor_msgs/PointCloud2"
 STAMPED = frozenset([IMAGE, COMPRESSED, CAMERA_INFO, ODOMETRY, POINTS]) | POSES
 """Types that begin with a header."""
 TRANSFORM_BYTES_MIN = 72
 """Time, two empty names, seven numbers."""
+POSE_BYTES_MIN = 68
+"""Time, an empty name, seven numbers."""
+PATH_POSES_MAX = 100_000
+"""Largest number of poses in a path: one a second for a day."""
 
 
 class WireReader:
@@ -160,6 +165,16 @@ class RosTransform:
         return transform_from_quaternion(self.pose[:3], self.pose[3:])
 
 
+@dataclass(frozen=True, slots=True)
+class RosPath:
+    """`nav_msgs/Path`: poses of one frame, each with its time."""
+
+    frame: str
+    """Frame that the poses are in."""
+    poses: list[RosTransform]
+    """In their order; a child has no name."""
+
+
 def plain_type(name: str) -> str:
     """`sensor_msgs/Image` of ROS 2's `sensor_msgs/msg/Image`."""
     return name.replace("/msg/", "/")
@@ -210,6 +225,20 @@ def read_pose(data: bytes | memoryview, wire: Wire, *, type_name: str) -> RosTra
     header = header_of(fields, wire)
     child = fields.text() if type_name == ODOMETRY else ""
     return RosTransform(header.time_s, _frame(header.frame), _frame(child), fields.floats(7))
+
+
+def read_path(data: bytes | memoryview, wire: Wire) -> RosPath:
+    """A `nav_msgs/Path`."""
+    fields = WireReader(data, wire)
+    frame = header_of(fields, wire).frame
+    count = fields.length(POSE_BYTES_MIN)
+    if count > PATH_POSES_MAX:
+        raise ValueError(f"a path of {count} poses, at most {PATH_POSES_MAX} are read")
+    poses = []
+    for _ in range(count):
+        header = header_of(fields, wire)
+        poses.append(RosTransform(header.time_s, header.frame or frame, "", fields.floats(7)))
+    return RosPath(frame, poses)
 
 
 def header_of(fields: WireReader, wire: Wire) -> RosHeader:

@@ -38,6 +38,8 @@ from cairn_fusion.ros.messages import RosCameraInfo
 from cairn_map.errors import BadInputError, first_error
 
 MAPPING_BYTES_MAX = 1 << 20
+TOPICS_FILE = "topics.yaml"
+"""File next to a bag that says what its topics are, as a live robot's recording has it."""
 DECIDE = "DECIDE"
 """Word of a proposed file where a fact is missing that only the maker of the bag knows."""
 PLUMB_BOB = ("plumb_bob", "")
@@ -59,6 +61,8 @@ class Frames(Model):
     """The frame that stays: the map's voxels are in it."""
     base: Frame
     """The frame that moves, and carries the cameras."""
+    odom: Frame = "odom"
+    """The frame in which the base never jumps (REP 105); it counts where it is on the way from the base to the map."""
 
 
 class Poses(Model):
@@ -68,6 +72,15 @@ class Poses(Model):
     """tf, nav_msgs/Odometry, or geometry_msgs/PoseStamped."""
     max_gap_s: Seconds = 0.2
     """Largest time between two poses for interpolation, seconds."""
+
+
+class Corrections(Model):
+    """Source of poses that a SLAM corrects afterwards; of live robots only."""
+
+    topic: Topic
+    """nav_msgs/Path: all poses of the way, each with its time, published again when they are optimised."""
+    frame: Frame | None = None
+    """Frame of the body that the poses are of; None: the base."""
 
 
 class Intrinsics(Model):
@@ -167,6 +180,7 @@ class BagMapping(Model):
     name: Name = "bag"
     frames: Frames
     poses: Poses = Poses()
+    corrections: Corrections | None = None
     time_tolerance_s: Seconds = 0.02
     """Largest time between the range image and another image, seconds."""
     scans_per_measurement: Annotated[int, Field(ge=1, le=4096)] = 1
@@ -193,6 +207,16 @@ class BagMapping(Model):
                 if topic is not None
             }
         return wanted
+
+
+def mapping_next_to(bag: Path) -> BagMapping | None:
+    """The mapping that a folder with a bag holds; None: there is none.
+
+    Raises:
+        BadInputError: as `mapping_of`.
+    """
+    path = bag / TOPICS_FILE
+    return mapping_of(path) if path.is_file() else None
 
 
 def mapping_of(path: Path) -> BagMapping:

@@ -53,8 +53,13 @@ def test_messages_without_bytes_are_bounded_by_what_they_take_themselves() -> No
 
 
 def test_a_reader_that_waits_wakes_with_the_message_or_the_end() -> None:
-    inbox, found = Inbox(), []
-    reader = threading.Thread(target=lambda: found.extend([inbox.take(within_s=30.0), inbox.take(within_s=30.0)]))
+    inbox, found = Inbox(), list[list[BagMessage]]()
+
+    def read() -> None:
+        for _ in range(2):
+            found.append(inbox.take(within_s=30.0))
+
+    reader = threading.Thread(target=read)
     reader.start()
     inbox.put(BagMessage("/a", 1, b""))
     while not found:

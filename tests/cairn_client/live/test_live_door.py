@@ -6,115 +6,37 @@ import subprocess
 import sys
 import threading
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from itertools import count
+from itertools import count, pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 from tests.fixtures.client.bridge import Bridge, a_bridge
+from tests.fixtures.client.live_run import MAKE, NOWHERE, TOPICS, VOXEL_M, LiveRun, replay_digest, send_all
 from tests.fixtures.client.live_server import WAIT_S, LiveServer, wait_until
-from tests.fixtures.fusion.bags import ROS2, Messages, Timed, write_bag
+from tests.fixtures.fusion.bags import Timed
 from tests.fixtures.fusion.drive_mapping import mapping_text
-from tests.fixtures.fusion.live_drive import drive, in_bag_order, latched
+from tests.fixtures.fusion.live_drive import drive, latched
 from websockets.sync.server import ServerConnection, serve
 
 from cairn_client import main as cairn
 from cairn_client.live.foxglove_source import FoxgloveSource
-from cairn_client.live.live_mapping import LiveMapping
-from cairn_client.live.live_opening import EARLY_BYTES_MAX, OpenedLive, open_live, survey_live
+from cairn_client.live.live_opening import OpenedLive, open_live, survey_live
+from cairn_client.live.live_source import LiveSource
 from cairn_client.robot.robot import Robot
 from cairn_fusion.mapping.scan_gate import GateBounds, ScanGate
 from cairn_fusion.ros.bag_recording import Survey
-from cairn_fusion.ros.scan_decoder import ScanDecoder
+from cairn_fusion.ros.live_scans import Cause
 from cairn_fusion.ros.topic_mapping import BagMapping, mapping_from_yaml
 from cairn_map.errors import BadInputError
-from cairn_map.evidence.channels import COLOUR, TEMPERATURE
-from cairn_map.evidence.grid import geometry_for
-
-MAKE = Messages(ROS2)
-NOWHERE = "http://127.0.0.1:9/maps/lab"
-VOXEL_M = 0.05
-GRID = geometry_for(voxel_edge_m=VOXEL_M, channels=(COLOUR, TEMPERATURE))
-MAPPING = mapping_from_yaml(mapping_text(), "drive")
-TOPICS = ("/tf", "/tf_static", "/depth/image", "/depth/info", "/colour/image", "/colour/info", "/warm/image")
 
 
 @pytest.fixture
 def bridge() -> Iterator[Bridge]:
     with a_bridge() as bridge:
         yield bridge
-
-
-class LiveRun:
-    """A live robot in this thread, which takes what the bridge has sent."""
-
-    def __init__(
-        self,
-        bridge: Bridge,
-        folder: Path,
-        timed: Sequence[Timed],
-        gate: ScanGate,
-        *,
-        early_bytes_max: int = EARLY_BYTES_MAX,
-    ) -> None:
-        self.bridge = bridge
-        self.source = FoxgloveSource(bridge.url)
-        opening = threading.Thread(target=self._begin, args=(timed,))
-        opening.start()
-        self.opened = opened = open_live(self.source, MAPPING, early_bytes_max=early_bytes_max)
-        opening.join()
-        self.scans = opened.scans
-        self.robot = Robot(opened.rig, NOWHERE, directory=folder, name="live", geometry=GRID, stay=True)
-        decoder = ScanDecoder("drive", MAPPING, opened.rig, opened.topics)
-        # A clock that stands still: no scan waits too long, however slow the machine is.
-        self.live = LiveMapping(self.robot, self.scans, decoder, gate, steady_s=lambda: 0.0)
-        self.live.step(opened.early)
-
-    def _begin(self, timed: Sequence[Timed]) -> None:
-        """Send what a rig is built from, once all is subscribed."""
-        self.bridge.wait_for(*TOPICS)
-        self.bridge.latch(latched(MAKE))
-        for topic in TOPICS[2:]:
-            self.bridge.send(next(entry for entry in timed if entry[1] == topic))
-
-    def take_until(self, is_done: Callable[[], bool]) -> None:
-        def step() -> bool:
-            self.live.step(self.source.take(within_s=0.01))
-            return is_done()
-
-        wait_until(step)
-
-    def finish(self) -> str:
-        """End; the digest of the map."""
-        self.source.close()
-        self.live.step(self.source.take(within_s=0.0))
-        self.live.finish()
-        digest = self.robot.map.digest()
-        self.robot.close()
-        return digest
-
-
-def replay_digest(folder: Path, timed: Sequence[Timed], *options: str) -> str:
-    """Digest of the map of a replay of these messages as a bag."""
-    bag = write_bag(folder / "drive", "mcap", lambda make: in_bag_order(timed))
-    (folder / "drive.yaml").write_text(mapping_text())
-    command = ("robot", "replay", str(bag), "--topics", str(folder / "drive.yaml"), "--map", NOWHERE)
-    state = ("--state", str(folder / "replay"), "--name", "replay", "--voxel", str(VOXEL_M))
-    assert cairn.main([*command, *state, *options]) == 0
-    with Robot(None, NOWHERE, directory=folder / "replay", name="replay", stay=True) as robot:
-        return robot.map.digest()
-
-
-def send_all(run: LiveRun, timed: Sequence[Timed]) -> None:
-    """Send a drive, some seconds of it at a time, and take it: the bridge keeps no more for a slow reader."""
-    for start in range(0, len(timed), 500):
-        part = timed[start : start + 500]
-        due = run.source.counts + Counter(topic for _, topic, _ in part)
-        for entry in part:
-            run.bridge.send(entry)
-        run.take_until(lambda due=due: due <= run.source.counts and not run.live.is_behind)  # type: ignore[misc]
 
 
 @pytest.mark.slow
@@ -136,24 +58,34 @@ def test_200_scans_through_the_door_are_the_map_of_their_replay(
     assert (run.live.not_moved == 0) is (bounds is None)
 
 
+KILLS = 20
+
+
 @pytest.mark.slow
-def test_a_bridge_that_starts_again_is_found_again_and_no_scan_comes_twice(bridge: Bridge, tmp_path: Path) -> None:
+def test_a_bridge_that_is_killed_20_times_is_found_again_and_no_scan_comes_twice(
+    bridge: Bridge, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cairn_client.live.foxglove_source.AGAIN_S", (0.02,))
     timed = drive(MAKE, scans=60)
+    kinds = {topic: message.__msgtype__ for _, topic, message in timed}
     bridge.offer_all(timed)
     run = LiveRun(bridge, tmp_path / "live", timed, ScanGate(None))
-    third = len(timed) // 3
-    parts = timed[1:third], timed[third - 60 : 2 * third], timed[2 * third :]
-    for part, topics in zip(parts, (TOPICS, TOPICS[::-1], TOPICS), strict=True):
-        send_all(run, part)
+    ends = [1 + (len(timed) - 1) * n // (KILLS + 1) for n in range(KILLS + 2)]
+    order = np.random.default_rng(3)
+    for start, end in pairwise(ends):
+        # Some of what came before the kill comes again after it.
+        send_all(run, timed[max(1, start - 12) : end])
+        if end == len(timed):
+            break
         bridge.stop()
         run.take_until(lambda: run.source.lost_since_s is not None)
         bridge.start()
-        kinds = {topic: message.__msgtype__ for _, topic, message in timed}
-        for topic in topics:  # under other ids
+        for topic in order.permutation(TOPICS).tolist():  # under other ids
             bridge.offer(topic, kinds[topic])
         bridge.latch(latched(MAKE))
         run.take_until(lambda: run.source.lost_since_s is None and all(bridge.subscribed[topic] for topic in TOPICS))
-    assert run.source.links == 4
+    assert run.source.links == KILLS + 1
+    assert run.scans.left_out[Cause.AGAIN] > 10
     assert run.finish() == replay_digest(tmp_path, timed, "--every-scan")
 
 
@@ -284,7 +216,13 @@ def test_no_bridge_and_what_is_none_are_told_apart(tmp_path: Path, capsys: pytes
         assert "speaks none of foxglove.sdk.v1" in refused(capsys, tmp_path, url)
 
 
-@pytest.mark.parametrize("url", ["zenoh://127.0.0.1:1", "ws://h:99999", "ws://h:abc", "ws://[::1", "ws://a..b:1"])
+@pytest.mark.parametrize(
+    "url",
+    [
+        *("zenoh://", "zenoh://h/key", "rosbridge://h:9090", "ros2:?domain=x", "ros2:/depth"),
+        *("ws://h:99999", "ws://h:abc", "ws://[::1", "ws://a..b:1"),
+    ],
+)
 def test_what_is_no_url_of_a_bridge_is_refused(url: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "ws://HOST:PORT" in refused(capsys, tmp_path, url)
     assert cairn.main(["robot", "inspect", url]) == 2
@@ -301,7 +239,7 @@ def test_topics_that_are_missing_silent_or_of_another_type_are_named(
     timed = drive(MAKE, scans=3)
     offered: set[str] = {topic for topic in TOPICS if topic != "/warm/image"}
 
-    def open_patiently(source: FoxgloveSource, mapping: BagMapping) -> OpenedLive:
+    def open_patiently(source: LiveSource, mapping: BagMapping) -> OpenedLive:
         """Open by a clock that stands still until the bridge has said what it offers."""
         clock = clock_after(lambda: offered <= source.topics.keys())
         return open_live(source, mapping, within_s=2.0, steady_s=clock)
@@ -377,6 +315,8 @@ def test_the_command_maps_until_a_signal_and_says_what_came(bridge: Bridge, tmp_
         str(VOXEL_M),
         "--every-scan",
         "--json",
+        "--record",
+        "lab",
     ]
     with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as running:
         try:
@@ -403,6 +343,13 @@ def test_the_command_maps_until_a_signal_and_says_what_came(bridge: Bridge, tmp_
     assert {topic["topic"] for topic in last["topics"]} == set(TOPICS) and last["links"] == 1
     assert any("clock apart" in text for text in last["missing"])  # the stamps are of 2023
     assert json.loads(out.splitlines()[-1])["commits"] >= 1
+    command = ["robot", "replay", str(tmp_path / "lab"), "--map", NOWHERE, "--state", str(tmp_path / "again")]
+    assert cairn.main([*command, "--name", "again", "--voxel", str(VOXEL_M)]) == 0
+    with (
+        Robot(None, NOWHERE, directory=tmp_path / "live", name="live", stay=True) as live,
+        Robot(None, NOWHERE, directory=tmp_path / "again", name="again", stay=True) as again,
+    ):
+        assert live.map.digest() == again.map.digest()
 
 
 @pytest.mark.slow
@@ -411,7 +358,7 @@ def test_inspect_proposes_from_a_live_source_what_live_takes(
 ) -> None:
     timed = [entry for entry in drive(MAKE, scans=20) if not entry[1].startswith("/warm")]
 
-    def survey_all(source: FoxgloveSource, *, seconds: float, on_message: Callable[[], object]) -> Survey:
+    def survey_all(source: LiveSource, *, seconds: float, on_message: Callable[[], object]) -> Survey:
         """Listen by a clock that stands still until all has come."""
         clock = clock_after(lambda: source.counts.total() >= len(timed))
         return survey_live(source, seconds=seconds, on_message=on_message, steady_s=clock)

@@ -6,9 +6,9 @@ from itertools import groupby
 from pathlib import Path
 
 import pytest
-from tests.fixtures.fusion.bags import ROS2, Messages, write_bag
-from tests.fixtures.fusion.drive_mapping import TOPICS, mapping_text
-from tests.fixtures.fusion.live_drive import bag_message, drive, in_bag_order
+from tests.fixtures.client.live_run import GRID, MAKE, MAPPING, NOWHERE, Clock
+from tests.fixtures.fusion.drive_mapping import TOPICS
+from tests.fixtures.fusion.live_drive import bag_message, drive
 
 from cairn_calib.rig.rig import Rig
 from cairn_client.live.live_mapping import BEHIND_S, REST_S, LiveMapping
@@ -17,38 +17,13 @@ from cairn_client.robot.robot import Robot
 from cairn_client.sync.responses import TimeSample
 from cairn_fusion.mapping.scan_gate import ScanGate
 from cairn_fusion.ros.bag import BagMessage
-from cairn_fusion.ros.bag_recording import open_bag_recording
-from cairn_fusion.ros.live_scans import Cause, LiveScans
+from cairn_fusion.ros.live_scans import Cause, LiveScans, ReadyScan
 from cairn_fusion.ros.scan_decoder import ScanDecoder
-from cairn_fusion.ros.topic_mapping import mapping_from_yaml
 from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import UnreachableError
-from cairn_map.evidence.channels import COLOUR, TEMPERATURE
-from cairn_map.evidence.grid import Geometry, geometry_for
+from cairn_map.evidence.grid import Geometry
 
-NOWHERE = "http://127.0.0.1:9/maps/lab"
-GRID = geometry_for(voxel_edge_m=0.05, channels=(COLOUR, TEMPERATURE))
-MAPPING = mapping_from_yaml(mapping_text(), "drive")
-DRIVE = drive(Messages(ROS2), scans=100)
-
-
-@pytest.fixture(scope="module")
-def rig(tmp_path_factory: pytest.TempPathFactory) -> Rig:
-    path = write_bag(tmp_path_factory.mktemp("bags") / "drive", "mcap", lambda make: in_bag_order(DRIVE))
-    return open_bag_recording(path, MAPPING).rig
-
-
-class Clock:
-    """Steady seconds that a test sets."""
-
-    def __init__(self) -> None:
-        self.now_s = 0.0
-        self.tick_s = 0.0
-        """Time that each look takes."""
-
-    def __call__(self) -> float:
-        self.now_s += self.tick_s
-        return self.now_s
+DRIVE = drive(MAKE, scans=100)
 
 
 class Driven:
@@ -104,6 +79,23 @@ def test_a_robot_slower_than_its_cameras_maps_the_newest_and_counts_the_rest(dri
     driven.check_account()
     assert driven.live.dropped > 50 and driven.live.waiting == 0
     assert driven.scans.arrived.total() == 100
+
+
+@pytest.mark.slow
+def test_what_a_slow_robot_holds_does_not_grow(driven: Driven) -> None:
+    held = []
+    for n, entry in enumerate(drive(MAKE, scans=600)):  # a minute
+        driven.scans.add(bag_message(entry), entry[0])
+        if n % 12 == 0:
+            driven.clock.now_s = entry[0]
+            driven.step([])  # maps a scan of three or four
+            held.append(driven.scans.held_bytes + sum(map(_size, driven.live._backlog)))
+    assert max(held[len(held) // 2 :]) < 1.2 * max(held[: len(held) // 2])
+    assert driven.live.dropped > 200
+
+
+def _size(ready: ReadyScan) -> int:
+    return sum(len(message.data) for message in ready.messages.values())
 
 
 def test_what_cannot_be_decoded_is_left_out_and_counted(driven: Driven) -> None:

@@ -8,6 +8,7 @@ import pytest
 from mcap.reader import make_reader
 from tests.fixtures.fusion.cdr_reader import read_message
 from tests.fixtures.map.made import SMALL
+from tests.fixtures.map.marks import mark
 from tests.fixtures.map.worlds import random_map
 
 from cairn_client.publish.mcap_file import McapFile
@@ -42,6 +43,7 @@ def all_messages() -> list[MapMessage]:
         map_messages.transforms_message("/tf", {"mole": MOLE}, "map", NOW_NS),
         map_messages.path_message("/cairn/robots/mole/path", [MOLE, MOLE], "map", NOW_NS),
         map_messages.hot_spots_message("/cairn/hot_spots", [HotSpot((1.0, 2.0, 0.5), 353.15)], "map", NOW_NS),
+        map_messages.marks_message("/cairn/marks", [mark()], "map", NOW_NS),
         map_messages.octomap_message("/cairn/octomap", TREE, 0.04, "map", NOW_NS),
     ]
 
@@ -106,6 +108,16 @@ def test_hot_spots_replace_those_of_before_and_say_their_temperature() -> None:
     assert [marker["text"] for marker in markers] == ["", "80.0 °C", "", "20.0 °C"]
     assert [marker["pose"]["position"]["z"] for marker in markers[::2]] == [0.5, 0.9]
     assert all(marker["color"]["a"] > 0 and marker["scale"]["x"] > 0 for marker in markers)
+
+
+def test_marks_are_boxes_or_spheres_with_their_names() -> None:
+    marks = [mark("lamp"), mark("door", kind="door", extent_m=(0.8, 0.1, 0.0))]
+    first, *markers = fields_of(map_messages.marks_message("/marks", marks, "map", NOW_NS))["markers"]  # type: ignore[misc]
+    assert first["action"] == 3 and {marker["ns"] for marker in (first, *markers)} == {"marks"}
+    assert [marker["type"] for marker in markers] == [2, 9, 1, 9]  # sphere, text, cube, text
+    assert [marker["text"] for marker in markers[1::2]] == ["lamp (hot_spot)", "door (door)"]
+    assert list(markers[2]["scale"].values()) == pytest.approx([0.8, 0.1, 0.01])
+    assert list(markers[0]["pose"]["position"].values()) == pytest.approx([1.0, -2.0, 0.5])
 
 
 def test_an_octree_is_its_file_without_the_head() -> None:

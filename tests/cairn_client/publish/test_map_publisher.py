@@ -23,6 +23,7 @@ from cairn_map.errors import NotFoundError, UnreachableError
 from cairn_map.evidence.evidence import Evidence, packed_evidence
 from cairn_map.evidence.grid import CellKey, cell_key
 from cairn_map.wire.live_events import CellsEvent
+from cairn_map.wire.mark_messages import MarkRequest, MarkText
 from cairn_map.wire.messages import RobotStatus
 
 BAND = (0.05, 0.25)
@@ -191,3 +192,18 @@ def test_a_long_path_keeps_its_begin_and_a_bounded_number_of_poses(published: Pu
     places = [pose["pose"]["position"]["x"] for pose in path["poses"]]
     assert POSES_MAX / 2 <= len(places) <= POSES_MAX + 1
     assert (places[0], places[-1]) == (0.0, 0.06 * (count - 1))
+
+
+def test_marks_are_published_as_they_come_and_go(published: Published) -> None:
+    api, publisher = published.api, published.publisher
+    publisher.publish_marks()
+    assert published.shelf.of("/cairn/marks") == []
+    door = MarkText(kind="door", name="north door", place_m=(1.0, 2.0, 0.5), extent_m=(1.0, 0.1, 2.0))
+    key = api.put_mark(MAP, MarkRequest(mark=door)).key
+    publisher.publish_marks()
+    publisher.publish_marks()
+    assert key is not None
+    api.put_mark(MAP, MarkRequest(of=key))
+    publisher.publish_marks()
+    texts = [[marker["text"] for marker in found["markers"]] for found in published.shelf.of("/cairn/marks")]
+    assert texts == [["", "", "north door (door)"], [""]]

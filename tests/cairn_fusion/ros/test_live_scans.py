@@ -118,6 +118,29 @@ def test_a_pose_that_comes_within_the_wait_makes_the_scan() -> None:
     assert scans.alone == 1 and not scans.left_out
 
 
+def test_poses_that_come_out_of_order_give_the_poses_of_their_stamps(replay: BagRecording) -> None:
+    rng, scans = np.random.default_rng(4), live()
+    order = sorted(range(len(DRIVE)), key=lambda n: DRIVE[n][0] + (rng.uniform(0, 0.3) if DRIVE[n][1] == "/tf" else 0))
+    found: list[ReadyScan] = []
+    for n in order:
+        scans.add(bag_message(DRIVE[n]), DRIVE[n][0])
+    found += scans.ready(np.inf, is_over=True)
+    assert decoded(found, replay.rig) == [encode_scan(scan) for scan in replay]
+
+
+def test_transforms_that_are_missing_for_ten_seconds_leave_those_scans_out_alone() -> None:
+    scans, ready = live(), list[ReadyScan]()
+    timed = [entry for entry in drive(MAKE, scans=150) if entry[1] != "/tf" or not 2 < entry[0] - START_S < 12]
+    for entry in timed:
+        scans.add(bag_message(entry), entry[0])
+        ready += scans.ready(entry[0])
+    ready += scans.ready(np.inf, is_over=True)
+    times_s = [one.found.time_s - START_S for one in ready]
+    assert len(ready) + scans.left_out.total() == 150
+    assert not any(2.1 < time_s < 11.9 for time_s in times_s) and sum(time_s > 12.1 for time_s in times_s) >= 25
+    assert scans.left_out[Cause.TF_LATE] + scans.left_out[Cause.TF_GAP] >= 95
+
+
 def test_poses_too_far_apart_are_a_gap() -> None:
     scans = left(latched(MAKE), moving(MAKE, START_S - 1), depth(MAKE, START_S, 1), moving(MAKE, START_S + 1))
     assert scans.left_out == {Cause.TF_GAP: 1}

@@ -18,7 +18,7 @@ from cairn_map.errors import USAGE, BadInputError, ConflictError
 from cairn_map.progress import counting
 
 if TYPE_CHECKING:
-    from cairn_client.live.foxglove_source import FoxgloveSource
+    from cairn_client.live.live_source import LiveSource
     from cairn_fusion.ros.bag_index import TopicIndex
     from cairn_fusion.ros.bag_recording import Survey
 
@@ -32,7 +32,8 @@ file that says which of them are depth, colour, thermal images and poses. It nee
     $ cairn robot inspect lab.bag --output lab.yaml
     $ cairn robot replay lab.bag --topics lab.yaml --map URL --voxel 0.04
 
-A live robot is listened to for some seconds through its Foxglove bridge, and the same file proposed for `live`:
+A live robot is listened to for some seconds through its Foxglove bridge (or zenoh://HOST:PORT, or ros2:), and the same
+file proposed for `live`:
 
     $ cairn robot inspect ws://robot:8765 --output live.yaml
     $ cairn robot live ws://robot:8765 --topics live.yaml --map URL --voxel 0.04
@@ -45,11 +46,11 @@ def _inspect(args: argparse.Namespace) -> int:
     from cairn_fusion.importers import SourceLayout, detect_layout
 
     if isinstance(args.bag, str):
-        from cairn_client.live.foxglove_source import FoxgloveSource
+        from cairn_client.live.live_doors import open_door
 
         _check_output(args)
         try:
-            source = FoxgloveSource(args.bag)
+            source = open_door(args.bag, ca_file=args.ca)
         except BadInputError as exc:
             sys.stderr.write(f"cairn robot inspect: {one_line(exc.message)} [{exc.kind}]\n")
             return USAGE
@@ -66,7 +67,7 @@ def _inspect(args: argparse.Namespace) -> int:
     return _show_survey(args, found)
 
 
-def _listen(source: "FoxgloveSource", seconds: float) -> "Survey":
+def _listen(source: "LiveSource", seconds: float) -> "Survey":
     """Survey of a live robot."""
     from cairn_client.live.live_opening import survey_live
 
@@ -210,8 +211,9 @@ def add_parser(commands: Subparsers) -> None:
         "bag",
         type=_recording,
         metavar="RECORDING",
-        help="anything that replay takes, or ws://HOST:PORT of a live robot",
+        help="anything that replay takes, or ws://HOST:PORT, zenoh://HOST:PORT or ros2: of a live robot",
     )
+    inspect.add_argument("--ca", type=Path, metavar="FILE", help="issuer of the certificate of wss:// (this machine's)")
     inspect.add_argument(
         "--seconds", type=float, default=5.0, metavar="S", help="time for which a live robot is listened to (5)"
     )
@@ -224,4 +226,4 @@ def add_parser(commands: Subparsers) -> None:
 
 def _recording(text: str) -> Path | str:
     """A path, or the URL of a live robot as it stands."""
-    return text if "://" in text else Path(text)
+    return text if "://" in text or text.startswith("ros2:") else Path(text)

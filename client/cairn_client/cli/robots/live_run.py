@@ -6,15 +6,18 @@ import time
 from pathlib import Path
 
 from cairn_calib.rig.rig import Spectrum
-from cairn_client.cli.arguments import say
+from cairn_client.cli.arguments import say, shown_bytes
 from cairn_client.cli.event_lines import Stopping, lines_on_stderr, until_signal
 from cairn_client.cli.range_arguments import integrator_of, returns_line
 from cairn_client.cli.robot_arguments import gate_of, kept_scans_bytes, limits_of, scope_of
 from cairn_client.cli.robots.replay import default_name, ensure_map
-from cairn_client.live.foxglove_source import FoxgloveSource
+from cairn_client.live.live_doors import open_door
 from cairn_client.live.live_mapping import LiveMapping
 from cairn_client.live.live_opening import OpenedLive, open_live, survey_live
+from cairn_client.live.live_source import LiveSource
 from cairn_client.live.live_status import LiveStatus, StatusWatch
+from cairn_client.live.path_corrections import PathCorrections
+from cairn_client.live.scan_recorder import ScanRecorder
 from cairn_client.robot.robot import Robot
 from cairn_client.sync.responses import one_line
 from cairn_fusion.ros.scan_decoder import ScanDecoder
@@ -37,7 +40,7 @@ FLUSH_S = 8.0
 def run_live(args: argparse.Namespace) -> int:
     """Open the source and map until a signal comes; the exit code."""
     with until_signal() as stopping:
-        source = None
+        source = recorder = None
         try:
             # Everything that can be refused is, before anything is mapped.
             gate_of(args, is_standard=True)
@@ -46,8 +49,15 @@ def run_live(args: argparse.Namespace) -> int:
             if args.every <= 0:
                 raise BadInputError("bad_option", f"--every takes seconds above 0, got {args.every:g}")
             mapping = _mapping(args)
-            source = FoxgloveSource(args.source)
+            if mapping.corrections is not None and not kept_bytes:
+                raise BadInputError(
+                    "bad_option",
+                    f"the topics file names corrections ({mapping.corrections.topic}), which move scans that are kept: "
+                    "give --keep-scans 2000 (MB), or take corrections out of it",
+                )
+            source = open_door(args.source, ca_file=args.ca)
             opened = open_live(source, mapping)
+            recorder = None if args.record is None else ScanRecorder(args.record, opened, mapping)
             name = args.name or default_name(mapping.name)
             robot = Robot(
                 opened.rig,
@@ -67,16 +77,18 @@ def run_live(args: argparse.Namespace) -> int:
         except CairnError as exc:
             if source is not None:
                 source.close()
+            if recorder is not None:
+                recorder.close()
             sys.stderr.write(f"cairn robot live: {one_line(exc.message)} [{exc.kind}]\n")
             return USAGE
-        return _map(args, source, mapping, opened, robot, stopping)
+        return _map(args, source, mapping, opened, robot, recorder, stopping)
 
 
 def _mapping(args: argparse.Namespace) -> BagMapping:
     """The mapping of the topics: that of the file, else the proposed one if it leaves no question open."""
     if args.topics is not None:
         return mapping_of(args.topics)
-    source = FoxgloveSource(args.source)
+    source = open_door(args.source, ca_file=args.ca)
     try:
         proposal = survey_live(source, seconds=SURVEY_S, on_message=lambda: None).proposal
     finally:
@@ -88,6 +100,13 @@ def _mapping(args: argparse.Namespace) -> BagMapping:
             f"inspect {args.source} --output live.yaml`, edit it, and give it with --topics live.yaml",
         )
     return mapping_from_yaml(proposal.text, f"the topics proposed for {args.source}")
+
+
+def _corrections(mapping: BagMapping, opened: OpenedLive, robot: Robot) -> PathCorrections | None:
+    given, frame = mapping.corrections, mapping.frames.map
+    if given is None:
+        return None
+    return PathCorrections(robot, topic=given.topic, frame=frame, T_path_rig=opened.T_path_rig)
 
 
 def _channels(mapping: BagMapping) -> tuple[Channel, ...]:
@@ -104,10 +123,11 @@ def _channels(mapping: BagMapping) -> tuple[Channel, ...]:
 
 def _map(
     args: argparse.Namespace,
-    source: FoxgloveSource,
+    source: LiveSource,
     mapping: BagMapping,
     opened: OpenedLive,
     robot: Robot,
+    recorder: ScanRecorder | None,
     stopping: Stopping,
 ) -> int:
     """Map until a signal comes."""
@@ -118,8 +138,12 @@ def _map(
         decoder,
         gate_of(args, is_standard=True),
         profile=Profile(args.profile) if args.profile else None,
+        corrections=_corrections(mapping, opened, robot),
+        on_taken=(lambda ready: None) if recorder is None else recorder.add,
     )
-    watch = StatusWatch(robot.name, source, opened.scans, live, opened.topics, time.monotonic(), opened.dropped)
+    watch = StatusWatch(
+        robot.name, source, opened.scans, live, opened.topics, time.monotonic(), opened.dropped, recorder
+    )
     shown = _ShownStatus(watch, robot, as_json=args.json)
     try:
         with lines_on_stderr(robot.events()):
@@ -133,9 +157,14 @@ def _map(
             live.step(source.take(within_s=0.0))
             live.finish()
             last = shown.show_last()
+            if recorder is not None:
+                recorder.close()
             robot.close(flush_s=FLUSH_S)
     finally:
         source.close()
+        # Its index first: the push may take all the time that a container has.
+        if recorder is not None:
+            recorder.close()
         robot.close(flush_s=FLUSH_S)
     if not args.json:
         causes = {"not moved": live.not_moved, "dropped": live.dropped, **last.left_out}
@@ -144,6 +173,9 @@ def _map(
             f"mapped {live.taken} scans of {last.arrived} as {live.commits} commits{left}; {robot.waiting} commits wait"
         )
         say(returns_line(robot.returns))
+        if recorder is not None:
+            size = shown_bytes(recorder.size_bytes)
+            say(f"{args.record}: {recorder.scans} scans recorded, {size}; `cairn robot replay {args.record}` maps them")
     return 0
 
 

@@ -1,0 +1,218 @@
+"""Door of zenoh: ROS 2 over rmw_zenoh, or DDS behind zenoh-bridge-ros2dds; through a router, as its client.
+
+    zenoh://HOST:PORT?domain=0      that of `rmw_zenohd`, or of the bridge: port 7447
+
+Publishers announce themselves by liveliness tokens (`zenoh_keys`); a topic is subscribed as soon as there is one, once
+for all its publishers. Messages that publishers keep for those who come late, as of /tf_static, are asked for. zenoh
+calls back in threads of its own, which only put into the inbox; it also makes lost links again.
+"""
+
+import logging
+import struct
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+import zenoh
+from zenoh import ext
+
+from cairn_client.http.bridge_link import url_parts
+from cairn_client.live.inbox import Inbox
+from cairn_client.live.live_source import bad_url, domain_of
+from cairn_client.live.zenoh_keys import Publisher, publisher_of, tokens_of
+from cairn_fusion.ros.bag import BagMessage, Topic
+from cairn_fusion.ros.bag_index import STATIC_NAME
+from cairn_map.errors import BadInputError
+
+log = logging.getLogger(__name__)
+
+PORT = 7447
+DOMAIN = 0
+MESSAGE_BYTES_MAX = 64 << 20
+"""Largest message; a cloud of a million points with 48 bytes each has less."""
+CONNECT_S = 2.5
+LOOK_S = 0.25
+"""Time between two looks whether the router is there."""
+TOKENS_MAX = 10_000
+"""Most publishers that are known; more are left aside."""
+SENDERS_MAX = 10_000
+LATCHED_MAX = 16
+"""Messages that are asked of each publisher that keeps some: each node has a publisher of /tf_static of its own."""
+NUMBER = struct.Struct("<q")
+"""Sequence number, the head of rmw_zenoh's attachment; the publisher's id is its end."""
+ATTACHMENT_BYTES = 33
+ROUTER_HELP = (
+    "start one on the robot: `ros2 run rmw_zenoh_cpp rmw_zenohd` where RMW_IMPLEMENTATION is rmw_zenoh_cpp, else "
+    "`zenoh-bridge-ros2dds`"
+)
+
+
+class ZenohSource:
+    """Live source behind one router."""
+
+    def __init__(self, url: str, *, inbox: Inbox | None = None, steady_s: Callable[[], float] = time.monotonic) -> None:
+        """Args: url: zenoh://HOST:PORT, perhaps with ?domain=N.
+
+        Raises:
+            BadInputError: kind `bad_url`: it is none.
+        """
+        parts = url_parts(url, "zenoh")
+        if parts is None or parts.path.strip("/") or parts.fragment or parts.username:
+            raise bad_url(url)
+        try:
+            self._domain = domain_of(parts.query) if parts.query else DOMAIN
+        except ValueError as exc:
+            raise bad_url(url) from exc
+        host = f"[{parts.hostname}]" if ":" in (parts.hostname or "") else parts.hostname
+        self._endpoint = f"tcp/{host}:{parts.port or PORT}"
+        self.url = url
+        self.links = 0
+        self.damaged = 0
+        """Always 0: zenoh reads its own frames."""
+        self.lost_since_s: float | None = None
+        self._inbox = inbox or Inbox()
+        self._steady_s = steady_s
+        self._lock = threading.Lock()
+        self._wanted: Callable[[Topic], bool] = lambda topic: False
+        self._tokens: dict[str, Publisher] = {}
+        self._subscribers: dict[str, Any] = {}
+        """Subscriptions by key, those to the tokens included."""
+        self._missed: Counter[str] = Counter()
+        self._numbers: dict[tuple[str, bytes], int] = {}
+        """Sequence number of the last message, by topic and publisher."""
+        self._session: Any = None
+        self._closing = threading.Event()
+        self._changed = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    @property
+    def topics(self) -> dict[str, Topic]:
+        """Topics that are offered now, by name."""
+        with self._lock:
+            return {publisher.topic.name: publisher.topic for publisher in reversed(list(self._tokens.values()))}
+
+    @property
+    def counts(self) -> Counter[str]:
+        """Messages that came, by topic."""
+        return self._inbox.counts
+
+    @property
+    def dropped(self) -> Counter[str]:
+        """Messages that went for room here, or that the network lost by rmw_zenoh's own numbers; by topic."""
+        with self._lock:
+            return self._inbox.dropped + self._missed
+
+    def open(self, wanted: Callable[[Topic], bool]) -> None:
+        """Connect, and receive from here on.
+
+        Raises:
+            BadInputError: kind `no_router`: none answers there.
+        """
+        self._wanted = wanted
+        try:
+            self._session = zenoh.open(_config(self._endpoint))
+        except zenoh.ZError as exc:
+            said = str(exc).split(" at ")[0][:200]
+            raise BadInputError("no_router", f"no zenoh router answers at {self.url} ({said}); {ROUTER_HELP}") from exc
+        self.links = 1
+        for tokens in tokens_of(self._domain):
+            self._subscribers[tokens] = self._session.liveliness().declare_subscriber(
+                tokens, self._take_token, history=True
+            )
+        self._thread = threading.Thread(target=self._look_after, name="cairn-live", daemon=True)
+        self._thread.start()
+
+    def take(self, *, within_s: float) -> list[BagMessage]:
+        """All messages that wait, as soon as there are any."""
+        return self._inbox.take(within_s=within_s)
+
+    def close(self) -> None:
+        """End the link; what waits may still be taken."""
+        self._closing.set()
+        self._changed.set()
+        self._inbox.close()
+        if self._thread is not None:
+            self._thread.join(CONNECT_S + 1)
+        if self._session is not None:
+            self._session.close()
+            self._session = None
+
+    def _take_token(self, sample: "zenoh.Sample") -> None:
+        """Note that a publisher came or went; in a thread of zenoh's, which may declare nothing."""
+        token = str(sample.key_expr)
+        with self._lock:
+            if sample.kind == zenoh.SampleKind.DELETE:
+                self._tokens.pop(token, None)
+            elif len(self._tokens) < TOKENS_MAX and (publisher := publisher_of(token)) is not None:
+                self._tokens[token] = publisher
+        self._changed.set()
+
+    def _look_after(self) -> None:
+        """Subscribe to topics that come, and see whether the router is there, until `close`."""
+        while not self._closing.is_set():
+            self._changed.wait(LOOK_S)
+            self._changed.clear()
+            try:
+                self._subscribe_new()
+                self._note_link(is_there=bool(self._session.info.routers_zid()))
+            except zenoh.ZError as exc:
+                log.info("%s: %s", self.url, exc)
+
+    def _note_link(self, *, is_there: bool) -> None:
+        if is_there and self.lost_since_s is not None:
+            self.lost_since_s, self.links = None, self.links + 1
+        elif not is_there and self.lost_since_s is None:
+            self.lost_since_s = self._steady_s()
+            log.info("the link to %s is lost", self.url)
+
+    def _subscribe_new(self) -> None:
+        with self._lock:
+            publishers = {one.topic.name: one for one in reversed(list(self._tokens.values()))}
+        for publisher in publishers.values():
+            if publisher.key not in self._subscribers and not self._closing.is_set() and self._wanted(publisher.topic):
+                self._subscribers[publisher.key] = self._subscribe(publisher)
+
+    def _subscribe(self, publisher: Publisher) -> Any:
+        topic = publisher.topic.name
+
+        def take(sample: "zenoh.Sample") -> None:
+            if sample.kind == zenoh.SampleKind.PUT:
+                self._count_missed(topic, sample.attachment)
+                self._inbox.receive(topic, bytes(sample.payload))
+
+        if not (publisher.is_latched or STATIC_NAME in topic):
+            return self._session.declare_subscriber(publisher.key, take)
+        history = ext.HistoryConfig(detect_late_publishers=True, max_samples=LATCHED_MAX)
+        return ext.declare_advanced_subscriber(self._session, publisher.key, take, history=history)
+
+    def _count_missed(self, topic: str, attachment: "zenoh.ZBytes | None") -> None:
+        """Count the messages between the last number of a publisher and this one."""
+        if attachment is None or len(attachment) != ATTACHMENT_BYTES:
+            return
+        raw = bytes(attachment)
+        sender, number = (topic, raw[-16:]), NUMBER.unpack_from(raw)[0]
+        with self._lock:
+            last = self._numbers.pop(sender, None)
+            if last is not None and number > last + 1:
+                self._missed[topic] += number - last - 1
+            self._numbers[sender] = number if last is None else max(last, number)
+            while len(self._numbers) > SENDERS_MAX:
+                del self._numbers[next(iter(self._numbers))]
+
+
+def _config(endpoint: str) -> "zenoh.Config":
+    """Settings of a client of one router: it looks for no other, and listens to none."""
+    config = zenoh.Config()
+    for key, value in (
+        # A peer sees nothing behind rmw_zenoh's router, which does not forward between peers.
+        ("mode", '"client"'),
+        ("connect/endpoints", f'["{endpoint}"]'),
+        ("connect/timeout_ms", str(round(CONNECT_S * 1000))),
+        ("scouting/multicast/enabled", "false"),
+        ("scouting/gossip/enabled", "false"),
+        ("transport/link/rx/max_message_size", str(MESSAGE_BYTES_MAX)),
+    ):
+        config.insert_json5(key, value)
+    return config
