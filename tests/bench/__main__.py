@@ -38,6 +38,7 @@ from tests.bench.peers import peer_rows
 from tests.bench.publishing import publishing_rows
 from tests.bench.queries import query_rows
 from tests.bench.readings import reading_rows
+from tests.bench.rounds import round_rows
 from tests.bench.scale import scale_rows
 from tests.bench.server import server_rows
 from tests.bench.simulation import simulation_rows
@@ -295,6 +296,7 @@ PARTS: dict[str, Callable[[bool], Iterator[Row]]] = {
     "publishing": publishing_rows,
     "queries": query_rows,
     "readings": reading_rows,
+    "rounds": round_rows,
     "scale": scale_rows,
     "server": server_rows,
     "large-map": large_map_rows,

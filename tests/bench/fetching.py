@@ -22,7 +22,7 @@ from cairn_server.settings import Settings
 from cairn_server.store.sqlite.store import FILE_NAME, SqliteStore
 from cairn_server.store.stamps import blocks_after
 from cairn_server.store.store_rows import MapRow
-from cairn_server.sync.asked_cells import asked_of
+from cairn_server.sync.asked_cells import Asked, asked_of
 
 Row = tuple[str, str, str]
 
@@ -64,12 +64,16 @@ def _folded(store: SqliteStore, row: MapRow, bodies: Bodies, first: int, more: i
     return cursors
 
 
+def _answer(service: Service, row: MapRow, asked: Asked) -> bytes:
+    return b"".join(service.sync.replies.missing(row, "wren", asked).parts())
+
+
 def _age_rows(service: Service, row: MapRow, cursor: Cursor, age: int, last_bytes: int) -> Iterator[Row]:
     asked = asked_of(MissingRequest(cursor=str(cursor), kinds=["delta", "state", "full"]))
     start_s = time.process_time()
-    answer = service.sync.replies.missing(row, "wren", asked)
+    answer = _answer(service, row, asked)
     cold_s = time.process_time() - start_s
-    warm_s = cpu_s(lambda: service.sync.replies.missing(row, "wren", asked), 3)
+    warm_s = cpu_s(lambda: _answer(service, row, asked), 3)
     frames = [frame for frame in frames_of(answer) if isinstance(frame, CellFrame)]
     kinds = {frame.kind.name.lower(): 0 for frame in frames}
     for frame in frames:

@@ -74,7 +74,7 @@ def _asked_rows(service: Service, store: SqliteStore, row: MapRow) -> Iterator[R
     for asked, what in (({"since": "cursor"}, "of who was there before"), ({}, "of one without a vector")):
         request = asked_of(MissingRequest(cursor=before, kinds=["delta", "state", "full"], **asked))
         start_s = time.process_time()
-        answer = service.sync.replies.missing(row, "wren", request)
+        answer = b"".join(service.sync.replies.missing(row, "wren", request).parts())
         first_s = time.process_time() - start_s
         took_s = cpu_s(lambda request=request: service.sync.replies.missing(row, "wren", request), 5)  # type: ignore[misc]
         header, *frames = frames_of(answer)

@@ -166,7 +166,7 @@ class SimServer:
                 return found.data, found.seal
             case GetMissing(request):
                 sent = MissingRequest.model_validate_json(request.model_dump_json())
-                return service.sync.replies.missing(row, robot, asked_of(sent))
+                return b"".join(service.sync.replies.missing(row, robot, asked_of(sent)).parts())
             case GetIndex(author, held=held):
                 since = held.to if held else None
                 index = service.sync.replies.cell_index(row, author, since=since)

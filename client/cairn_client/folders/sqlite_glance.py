@@ -53,6 +53,8 @@ def glance(folder: Path) -> Glance:
     """
     with _Reader(folder) as reader:
         (cells, cells_bytes) = reader.rows("SELECT count(cursor), coalesce(sum(length(body)), 0) FROM cell")[0]
+        if reader.rows("SELECT 1 FROM sqlite_master WHERE name = 'delta'"):  # not in a folder of an older version
+            cells_bytes += reader.rows("SELECT coalesce(sum(length(body)), 0) FROM delta")[0][0]
         commits = reader.rows(
             "SELECT robot, incarnation, n, acked, json_array_length(iif(json_valid(cells), cells, '[]')), length(data)"
             " FROM commits"

@@ -27,7 +27,7 @@ from cairn_client.replica.replica_state import (
 )
 from cairn_client.replica.replica_store import KeptCommit
 from cairn_map.codec.cell_code import Profile
-from cairn_map.codec.layer_code import decode_row
+from cairn_map.codec.layer_code import decode_row, row_file
 from cairn_map.commits.commit import Commit, CommitMeta, ScanPose, make_commit, renamed_commit, split_commit
 from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.ids import Author, CommitId, RobotName
@@ -106,6 +106,17 @@ class CommitFacts:
 NO_FACTS = CommitFacts()
 
 
+@dataclass(frozen=True, slots=True)
+class Addition:
+    """Evidence that is added to a cell."""
+
+    data: bytes
+    """The same as a cell file of the map's version."""
+    history: CellHistory
+    commit: CommitId | None = None
+    """Own commit that it is all of in this cell; None: it came from the server."""
+
+
 class Outbox:
     """Own commits in a replica's store."""
 
@@ -173,6 +184,11 @@ class Outbox:
     def cells(self) -> set[CellKey]:
         """Cells that a kept commit touches."""
         return set(self._touching)
+
+    @property
+    def cells_in_doubt(self) -> set[CellKey]:
+        """Cells of the commits whose bytes are kept: those of which the view may be other than the server's cell."""
+        return {key for kept in self for key in kept.cells}
 
     def add(
         self,
@@ -461,12 +477,15 @@ class Outbox:
         """True if a commit was ever kept here."""
         return commit in self._commits
 
-    def own_evidence(self, key: CellKey, news: VersionVector, author: Author) -> list[CellHistory] | None:
+    def own_evidence(self, key: CellKey, news: VersionVector, author: Author) -> list[Addition] | None:
         """Evidence of a cell from an author's commits among `news`; None if the bytes of one are not kept any more."""
         mine = [commit for commit in self._touching.get(key, ()) if commit.author == author and commit in news]
         if not all(self._commits[commit].has_data for commit in mine):
             return None
-        return [self.history(commit, key) for commit in mine]
+        return [Addition(self._file(commit, key), self.history(commit, key), commit) for commit in mine]
+
+    def _file(self, commit: CommitId, key: CellKey) -> bytes:
+        return row_file(self._bodies(commit)[key], self._commits[commit].epoch, key, self._layer)
 
     def history(self, commit: CommitId, key: CellKey) -> CellHistory:
         """Evidence of one commit for a cell that it touches, as the row of its epoch.

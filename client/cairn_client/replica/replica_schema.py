@@ -13,7 +13,7 @@ import apsw
 
 from cairn_map.errors import BadInputError, DamagedDataError
 
-VERSION = 4
+VERSION = 6
 VALUE_BYTES_MAX = 256 << 20
 """Largest value that is read; a commit has at most 64 MB."""
 DDL = """
@@ -33,7 +33,7 @@ CREATE TABLE commits (
 CREATE TABLE coverage (name INTEGER PRIMARY KEY, vector TEXT NOT NULL UNIQUE);
 CREATE TABLE cell (
     cell INTEGER PRIMARY KEY,
-    cursor TEXT,                        -- NULL: not proven any more, to be fetched whole
+    cursor TEXT,                        -- NULL: not proven any more, to be fetched whole; or `together`
     coverage INTEGER NOT NULL REFERENCES coverage,
     fingerprint BLOB NOT NULL,
     etag TEXT,
@@ -41,16 +41,36 @@ CREATE TABLE cell (
 );
 CREATE INDEX cell_coverage ON cell (coverage);
 """
+DELTAS = """
+CREATE TABLE delta (                    -- evidence that was added to a cell since its body was written
+    number INTEGER PRIMARY KEY,
+    cell INTEGER NOT NULL REFERENCES cell,
+    body BLOB NOT NULL
+);
+CREATE INDEX delta_cell ON delta (cell);
+"""
+DDL += DELTAS
 STEPS = {
     1: "ALTER TABLE commits ADD COLUMN seal TEXT",
     # When older commits were acknowledged is unknown: they count from the first start with ages.
     2: "ALTER TABLE commits ADD COLUMN acked_age_s REAL NOT NULL DEFAULT 0",
     # Older commits are of maps without epochs.
     3: "ALTER TABLE commits ADD COLUMN epoch INTEGER",
+    # The same form: from here on cells may stand together, at the map's own cursor, which an older cairn cannot read.
+    4: "SELECT 1",
+    5: DELTAS,
 }
 """By version: what leads a store to the next one."""
-COLUMNS_SINCE = {("commits", "seal"): 2, ("commits", "acked_age_s"): 3, ("commits", "epoch"): 4}
-"""Columns that the steps added, by table and name: the first version that has each."""
+COLUMNS_SINCE = {
+    ("commits", "seal"): 2,
+    ("commits", "acked_age_s"): 3,
+    ("commits", "epoch"): 4,
+    ("delta", "number"): 6,
+    ("delta", "cell"): 6,
+    ("delta", "body"): 6,
+    ("delta", "delta_cell"): 6,
+}
+"""Columns and indices that the steps added, by table and name: the first version that has each."""
 KINDS = {"INTEGER": "'integer'", "REAL": "'real', 'integer'", "TEXT": "'text'", "BLOB": "'blob'"}
 """SQL of the storage classes that a column of a declared type may hold."""
 NULL = {True: "", False: ", 'null'"}

@@ -21,7 +21,7 @@ from cairn_client.replica.replica_schema import DDL, STEPS, VERSION, check_form,
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.cursor import Cursor, cursor_from_text
 from cairn_map.commits.ids import Author, CommitId
-from cairn_map.commits.version_vector import VersionVector, version_vector_from_json
+from cairn_map.commits.version_vector import EMPTY, VersionVector, version_vector_from_json
 from cairn_map.epochs.epoch import BASE, Epoch, check_epoch
 from cairn_map.errors import CairnError, ConflictError, DamagedDataError, UnreachableError
 from cairn_map.evidence.fingerprint import Fingerprint, fingerprint_from_bytes
@@ -38,6 +38,8 @@ PRAGMAS = (
     "journal_size_limit = 67108864",
 )
 ONE_COMMIT = "robot = ? AND incarnation = ? AND n = ?"
+TOGETHER = "together"
+"""Text in the place of a cell's cursor: the cell stands at the map's own cursor and coverage (`ReplicaState`)."""
 AGE = "age_s"
 """Key of the text that holds the store's age."""
 Values = tuple[str | int | float | bytes | None, ...]
@@ -52,6 +54,34 @@ class BaseCell:
     coverage: VersionVector
     fingerprint: Fingerprint
     etag: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class GroupedCell:
+    """A held cell that stands at the map's own state, without its bytes."""
+
+    fingerprint: Fingerprint
+    etag: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class StoredBases:
+    """All cells held, without their bytes."""
+
+    apart: dict[CellKey, BaseCell]
+    """Those with a state of their own."""
+    together: dict[CellKey, GroupedCell]
+    """Those that stand at the map's own state."""
+
+
+@dataclass(frozen=True, slots=True)
+class DeltaSizes:
+    """Sizes of what was added to a cell since its bytes were written."""
+
+    count: int
+    size_bytes: int
+    body_bytes: int
+    """Size of the cell's own bytes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,27 +272,43 @@ class ReplicaStore:
         """Remove a commit that lives on under another id."""
         self._run(f"DELETE FROM commits WHERE {ONE_COMMIT}", _values(commit))  # noqa: S608
 
-    def cells(self) -> dict[CellKey, BaseCell]:
+    def cells(self) -> StoredBases:
         """All cells held, without their bytes."""
         coverages = self._run("SELECT name, vector FROM coverage")
         rows = self._run("SELECT cell, cursor, coverage, fingerprint, etag FROM cell ORDER BY cell")
+        found = StoredBases({}, {})
         with translate_damage(self.file):
             vectors = {name: version_vector_from_json(json.loads(vector)) for name, vector in coverages}
-            return {
-                CellKey(cell): BaseCell(
-                    cursor_from_text(cursor) if cursor else None, vectors[name], fingerprint_from_bytes(sums), etag
-                )
-                for cell, cursor, name, sums, etag in rows
-            }
+            for cell, cursor, name, sums, etag in rows:
+                key, fingerprint = CellKey(cell), fingerprint_from_bytes(sums)
+                if cursor == TOGETHER:
+                    found.together[key] = GroupedCell(fingerprint, etag)
+                else:
+                    place = cursor_from_text(cursor) if cursor else None
+                    found.apart[key] = BaseCell(place, vectors[name], fingerprint, etag)
+        return found
 
     def body(self, key: CellKey) -> bytes | None:
         """Bytes of a cell held."""
         body: bytes | None = self._first("SELECT body FROM cell WHERE cell = ?", (key,))
         return body
 
+    def deltas(self, key: CellKey) -> list[bytes]:
+        """Evidence that was added to a cell since its bytes were written, oldest first, each as a cell's bytes."""
+        return [body for (body,) in self._run("SELECT body FROM delta WHERE cell = ? ORDER BY number", (key,))]
+
+    def delta_sizes(self, key: CellKey) -> DeltaSizes:
+        """Sizes of a cell held and of what was added to it."""
+        query = "SELECT count(*), coalesce(sum(length(body)), 0), (SELECT length(body) FROM cell WHERE cell = ?1)"
+        count, size_bytes, body_bytes = self._run(f"{query} FROM delta WHERE cell = ?1", (key,))[0]
+        return DeltaSizes(count, size_bytes, body_bytes or 0)
+
     def cell_bytes(self) -> dict[CellKey, int]:
         """Sizes of the cells held, as they are at rest."""
-        return {CellKey(cell): size for cell, size in self._run("SELECT cell, length(body) FROM cell")}
+        sizes = {CellKey(cell): size for cell, size in self._run("SELECT cell, length(body) FROM cell")}
+        for cell, size in self._run("SELECT cell, sum(length(body)) FROM delta GROUP BY cell"):
+            sizes[CellKey(cell)] += size
+        return sizes
 
     def used_bytes(self) -> int:
         """Size of the file, without its free pages."""
@@ -278,6 +324,22 @@ class ReplicaStore:
             " fingerprint = excluded.fingerprint, etag = excluded.etag, body = excluded.body",
             (key, str(cell.cursor) if cell.cursor else None, name, cell.fingerprint.to_bytes(), cell.etag, body),
         )
+        self._run("DELETE FROM delta WHERE cell = ?", (key,))
+
+    def put_deltas(self, key: CellKey, cell: BaseCell, bodies: Iterable[bytes]) -> None:
+        """Add evidence to a cell that is held; its cursor, coverage and fingerprint change with it."""
+        for body in bodies:
+            self._run("INSERT INTO delta (cell, body) VALUES (?, ?)", (key, body))
+        name = self._coverage(cell.coverage)
+        self._run(
+            "UPDATE cell SET cursor = ?, coverage = ?, fingerprint = ?, etag = ? WHERE cell = ?",
+            (str(cell.cursor) if cell.cursor else None, name, cell.fingerprint.to_bytes(), cell.etag, key),
+        )
+
+    def put_body(self, key: CellKey, body: bytes) -> None:
+        """Write a cell's bytes again, with what was added to it."""
+        self._run("UPDATE cell SET body = ? WHERE cell = ?", (body, key))
+        self._run("DELETE FROM delta WHERE cell = ?", (key,))
 
     def move_cells(self, keys: Iterable[CellKey], *, to: Cursor | None, coverage: VersionVector | None) -> None:
         """Give held cells another cursor, and coverage unless None; their bytes stay."""
@@ -287,11 +349,19 @@ class ReplicaStore:
                 "UPDATE cell SET cursor = ?, coverage = coalesce(?, coverage) WHERE cell = ?",
                 (str(to) if to else None, name, key),
             )
-        self._run("DELETE FROM coverage WHERE name NOT IN (SELECT coverage FROM cell)")
+        self._drop_coverages()
+
+    def join_cells(self, keys: Iterable[CellKey]) -> None:
+        """Let held cells stand at the map's own cursor and coverage from here on; their bytes stay."""
+        name = self._coverage(EMPTY)  # which says nothing: theirs is the map's
+        for key in keys:
+            self._run("UPDATE cell SET cursor = ?, coverage = ? WHERE cell = ?", (TOGETHER, name, key))
+        self._drop_coverages()
 
     def drop_cells(self) -> None:
         """Hold nothing of the server any more."""
         self._run("DELETE FROM cell")
+        self._run("DELETE FROM delta")
         self._run("DELETE FROM coverage")
 
     def close(self) -> None:
@@ -300,6 +370,10 @@ class ReplicaStore:
             self._connection.close()
             if self._folder_lock is not None:
                 self._folder_lock.close()
+
+    def _drop_coverages(self) -> None:
+        """Drop the coverages that no cell has any more; each is one look into the index of the cells."""
+        self._run("DELETE FROM coverage WHERE NOT EXISTS (SELECT 1 FROM cell WHERE cell.coverage = coverage.name)")
 
     def _coverage(self, coverage: VersionVector) -> int:
         """Name under which a coverage is kept: one row for all cells that share it."""

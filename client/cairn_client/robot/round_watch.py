@@ -38,13 +38,11 @@ class RoundWatch:
     @contextmanager
     def cell_changes(self) -> Iterator[None]:
         """Context of a round; after it, the cells that it changed are reported, also where the round failed."""
-        before = self._replica.fingerprints()
+        self._replica.take_changes()
         try:
             yield
         finally:
-            after = self._replica.fingerprints()
-            changed = sorted(key for key in after.keys() | before.keys() if after.get(key) != before.get(key))
-            if changed:
+            if changed := self._replica.take_changes():
                 self._events.send(CellsChanged(cells=tuple(cell_of_key(key) for key in changed)))
 
     def succeeded(self, report: RoundReport) -> None:

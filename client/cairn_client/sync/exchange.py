@@ -15,6 +15,7 @@ import logging
 
 import numpy as np
 
+from cairn_client.replica.outbox import Addition
 from cairn_client.replica.replica import Replica
 from cairn_client.replica.replica_store import BaseCell
 from cairn_client.replica.server_cells import UNPROVEN, ServerCells
@@ -65,7 +66,10 @@ class Exchange:
             self._author = replica.author
             self._held = replica.header
             self._default = base.default_cursor
-            self._asked = {key: cell.cursor for key, cell in base.cells.items() if is_within(key, box)}
+            # Where all cells are asked for by the map's own cursor, only those that stand elsewhere are looked at.
+            self._group = base.cells.group if box is None and not compare else None
+            listed = base.cells if self._group is None else base.cells.apart
+            self._asked = {key: cell.cursor for key, cell in listed.items() if is_within(key, box)}
         self._since = self._stated_since()
         # The request's bounds.
         self._compare = compare
@@ -76,6 +80,7 @@ class Exchange:
         self._header: ReplyHeader | None = None
         self._coverage = EMPTY
         self._framed: set[CellKey] = set()
+        self._left_by_frames = 0
         self._has_dropped = False
         self.damaged: list[CellKey] = []
         """Cells that came whole, but not sound: they are requested again, and the others are not held up."""
@@ -150,6 +155,7 @@ class Exchange:
             FrameKind.STATE: self._apply_state,
             FrameKind.RESET: self._apply_reset,
         }[frame.kind]
+        stood_together = base.cells.is_together(frame.cell)
         # A frame that leads to no sound cell changes nothing, and the cell is asked for whole.
         try:
             apply(base, frame)
@@ -158,6 +164,7 @@ class Exchange:
                 self.damaged.append(frame.cell)
             if frame.kind is not FrameKind.FULL or frame.cell not in base.cells:
                 self._ask_whole(base, frame.cell, exc.message)
+        self._left_by_frames += stood_together and not base.cells.is_together(frame.cell)
 
     def _apply_full(self, base: ServerCells, frame: CellFrame) -> None:
         history = self._payload(frame)
@@ -166,7 +173,7 @@ class Exchange:
         base.hold(frame.cell, self._at_head(frame), history, body=frame.payload)
 
     def _apply_delta(self, base: ServerCells, frame: CellFrame) -> None:
-        own: list[CellHistory] | None = []
+        own: list[Addition] | None = []
         # Rule 6: own commits between the two vectors are left out of the sum, so they are added from here.
         if frame.own_excluded:
             news = self._coverage.minus(base.coverage(frame.cell))
@@ -174,8 +181,15 @@ class Exchange:
         if own is None:
             self._ask_whole(base, frame.cell, "own commits that a delta leaves out are not kept any more")
             return
-        before = base.history(frame.cell)
-        self._hold_if_sound(base, frame, merged([before, *own, self._payload(frame)], self._replica.geometry))
+        # Fingerprints add as evidence does: neither the sums nor the bytes of the whole cell are made.
+        added = [*own, Addition(frame.payload, self._payload(frame))] if frame.payload else own
+        held = base.cells.get(frame.cell)
+        total = held.fingerprint if held else ZERO
+        total = sum((self._fingerprint(each.history, frame.cell) for each in added), total)
+        if total == frame.fingerprint:
+            base.add(frame.cell, self._at_head(frame), added)
+        else:
+            self._ask_whole(base, frame.cell, MISFIT)
 
     def _apply_state(self, base: ServerCells, frame: CellFrame) -> None:
         before = base.history(frame.cell)
@@ -204,16 +218,33 @@ class Exchange:
         rest = {key: cell for key in unframed if (cell := base.cells.get(key)) is not None}
         total = sum((cell.fingerprint for cell in rest.values()), ZERO)
         stands = {key: cell.cursor for key, cell in rest.items()}
-        if stands != {key: self._asked[key] for key in unframed} or total != done.rest_fingerprint:
+        # A frame that brought nothing sound leaves its cell where it was, with the others: it stays behind.
+        staying = [key for key in self._framed if base.cells.is_together(key)]
+        if self._group is not None:
+            total += base.cells.sum_together - sum((base.cells[key].fingerprint for key in staying), ZERO)
+        if (
+            stands != {key: self._asked[key] for key in unframed}
+            or not self._stands_as_asked(base)
+            or total != done.rest_fingerprint
+        ):
             log.warning("cells without a frame do not add up to the server's; comparing all fingerprints")
             self.must_compare = True
             return
         # All of them move at once; a cell that is not held moves with the default cursor, unless a box was asked for.
-        base.move(rest, to=done.to_cursor, coverage=self._coverage)
         if self._box is None:
-            base.set_default_cursor(done.to_cursor, self._coverage)
+            base.advance(done.to_cursor, self._coverage, joining=rest, staying=staying)
+        else:
+            base.move(rest, to=done.to_cursor, coverage=self._coverage)
         self._replica.forget_stable_commits()
         self.is_done = True
+
+    def _stands_as_asked(self, base: ServerCells) -> bool:
+        """True if no cell that stood with the others at the request left them, but for a frame of this answer."""
+        if self._group is None:
+            return True
+        now = base.cells.group
+        is_same = now.version == self._group.version or not self._group.count
+        return is_same and self._group.count - now.count == self._left_by_frames
 
     def _payload(self, frame: CellFrame) -> CellHistory:
         # Nothing to add, or no block that still holds evidence.

@@ -432,4 +432,6 @@ def _complain(damaged: Sequence[CellKey]) -> None:
 
 def _has_unproven(replica: Replica, box: Box | None) -> bool:
     """True if a cell still waits to be fetched whole."""
-    return any(cell.cursor is None for key, cell in replica.cells.items() if is_within(key, box))
+    with replica.changing() as base:
+        # Those that stand together have a proven cursor.
+        return any(cell.cursor is None for key, cell in base.cells.apart.items() if is_within(key, box))

@@ -247,14 +247,22 @@ class TallyPool:
         self._around_m = around_m
         self._lock = Lock()
         self._closed = EvidenceMap(geometry)
+        self._first: Diff | None = None
+        """Evidence that was counted elsewhere, as it came, while it is all there is: a sweep need not be added up."""
         self._users: dict[BrickTally, int] = {}
         """Number of threads that are adding to each open tally."""
         self._idle: list[ScanHits] = []
 
     def merge(self, diff: Diff) -> None:
         """Add evidence that was counted elsewhere."""
+        if not diff:
+            return
         with self._lock:
-            self._closed.merge(diff)
+            if self._first is None and not len(self._closed):
+                self._first = diff
+            else:
+                self._settle()
+                self._closed.merge(diff)
 
     @contextmanager
     def around(self, origin_m: Floats, farthest_m: float) -> Iterator[tuple[BrickTally, ScanHits]]:
@@ -282,11 +290,20 @@ class TallyPool:
 
     def packed(self, each: Each = map) -> Diff:
         """Packed evidence of all cells that hold any, rising in number; `each` as for `BrickTally.packed`."""
-        if len(self._users) == 1 and not len(self._closed):
+        if len(self._users) == 1 and self._first is None and not len(self._closed):
             # Most measurements end here: all scans in one tally, nothing to add up.
             return next(iter(self._users)).packed(each)
+        if self._first is not None and not self._users and not len(self._closed):
+            return {key: self._first[key] for key in sorted(self._first) if len(self._first[key])}
+        self._settle()
         self._close_idle(each)
         return self._closed.packed()
+
+    def _settle(self) -> None:
+        """Add what was counted elsewhere to the sum."""
+        if self._first is not None:
+            self._closed.merge(self._first)
+            self._first = None
 
     def _new_tally(self, origin_m: Floats, farthest_m: float) -> BrickTally:
         # The first tally at the place that was given, if this scan fits there.

@@ -28,7 +28,7 @@ from cairn_calib.rig.rig import LIDAR, LIDAR_REACH_M, TIME_OF_FLIGHT_REACH_M, Mo
 from cairn_fusion.mapping.beam_returns import ReturnCounts, Returns, clear_image, returns_of
 from cairn_fusion.mapping.brick_tally import Each, TallyPool
 from cairn_fusion.mapping.free_space import Window, carving_of, window_of
-from cairn_fusion.mapping.ray_casting import beam_evidence, clear_ends, silent_ends
+from cairn_fusion.mapping.ray_casting import beam_evidence, carried, clear_ends, silent_ends
 from cairn_fusion.mapping.samples import sample_sums
 from cairn_fusion.recording.scan import Scan, check_scan
 from cairn_fusion.transfer.transfer import DEPTH_TOLERANCE_M
@@ -208,9 +208,9 @@ class Integration:
             kept &= ~self._rig.body.holds(transform_points(T_body_sensor, own))
         # Clear up to a margin before each point, by its noise.
         sigma_m = LIDAR.sigma_at(range_m[kept], usual=LIDAR) if of is None else of.range_sigma_m(range_m[kept])
-        points_map = transform_points(T, own[kept])
+        points_map = carried(own[kept], T)
         clear_m = self._clear_ends(T[:3, 3], points_map, sigma_m)
-        self._tallies.merge(beam_evidence(T[:3, 3], points_map, clear_m, self._geometry, sums_of=self._no_sums))
+        self._tallies.merge(beam_evidence(T[:3, 3], points_map, clear_m, self._geometry, sums_of=None))
         counts = ReturnCounts(
             used=len(points_map),
             no_return=int(np.count_nonzero(void)),
@@ -293,9 +293,6 @@ class Integration:
     def _clear_ends(self, origin_m: Floats, points_map: Floats, sigma_m: Floats) -> Floats:
         edge_m, sigmas = self._geometry.voxel_edge_m, self._integrator.noise_sigmas
         return clear_ends(origin_m, points_map, sigma_m, voxel_edge_m=edge_m, noise_sigmas=sigmas)
-
-    def _no_sums(self, _: Ints, count: int) -> Ints:
-        return np.zeros((count, self._geometry.plane_count), np.int64)
 
 
 def integrate_scan(scan: Scan, rig: Rig, geometry: Geometry, *, integrator: Integrator) -> dict[CellKey, Evidence]:

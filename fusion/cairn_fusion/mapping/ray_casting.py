@@ -12,15 +12,25 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from cairn_calib.rig.poses import Transform
 from cairn_fusion.mapping.beam_returns import Returns, margins_m
-from cairn_fusion.mapping.cast_kernels import HIT, mark_hits_into, mark_misses_into
-from cairn_map.arrays import Floats, Ints
+from cairn_fusion.mapping.cast_kernels import (
+    END,
+    HIT,
+    Marks,
+    carry_into,
+    clear_ends_into,
+    count_seen_into,
+    mark_ends_into,
+    mark_misses_into,
+    pack_seen_into,
+)
+from cairn_map.arrays import Floats, Ints, Words32
 from cairn_map.errors import BadInputError
-from cairn_map.evidence.evidence import Evidence, packed_evidence
+from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import BRICK_DEPTH, CELL_LIMIT, CellKey, Geometry, split_voxels, voxels_of_points
-from cairn_map.kernels.morton_kernels import interleave
+from cairn_map.kernels.morton_kernels import UInts, interleave
 
 Sums = Callable[[Ints, int], Ints]
 """From the number of each point's voxel (N,) and the count of voxels to (count, P) sums of samples."""
@@ -30,38 +40,78 @@ BOX_BRICKS_MAX = 1 << 27
 
 
 @dataclass(frozen=True, slots=True)
-class SeenVoxels:
-    """Hits and misses of one scan, by cell, ready to be packed.
+class SeenBricks:
+    """Bricks that one scan touched, in order of cell and of number in the cell, with a mark for each voxel."""
 
-    cells (N,) uint64 cell numbers, rising; places (N,) uint32 Morton codes, rising inside a cell; hit (N,) bool.
-    """
+    cells: UInts
+    """(B,) cell of each brick."""
+    numbers: Words32
+    """(B,) Morton number of each within its cell."""
+    slots: Ints
+    """(B,) its row of `marks`."""
+    marks: Marks
+    """(M, 512) bits `MISS` and `HIT` of the voxels; a hit wins."""
 
-    cells: npt.NDArray[np.uint64]
-    places: npt.NDArray[np.uint32]
-    hit: npt.NDArray[np.bool_]
+    def evidence(self, samples: "Samples | None", geometry: Geometry) -> dict[CellKey, Evidence]:
+        """Hits, misses and samples by cell."""
+        # How many voxels of each brick are known, and so where those of each begin.
+        known = np.empty(len(self.slots), np.int64)
+        count_seen_into(self.slots, self.marks, known)
+        # One array for all cells: fresh pages cost more than everything that is written to them.
+        ends = np.concatenate([[0], np.cumsum(known)])
+        places, counts = np.empty(int(ends[-1]), np.uint32), np.empty((int(ends[-1]), 2), np.int32)
+        pack_seen_into(self.slots, self.numbers, self.marks, places, counts)
+        found: dict[CellKey, Evidence] = {}
+        cells, first = np.unique(self.cells, return_index=True)
+        # Bricks are in order of their cells, so a cell is one slice of all.
+        bounds = ends[np.append(first, len(self.cells))].tolist()
+        no_rows, none_sampled = np.empty((0, geometry.plane_count), np.int64), np.empty(0, np.uint32)
+        for cell, start, stop in zip(cells, bounds[:-1], bounds[1:], strict=True):
+            if start == stop:
+                continue
+            sampled, rows = none_sampled, no_rows
+            if samples is not None:
+                # A cell's hits, and its rows of samples, are of the same voxels in the same order.
+                rows = samples.of(cell)
+                some = (rows != 0).any(axis=1)
+                sampled, rows = np.flatnonzero(counts[start:stop, 0])[some].astype(np.uint32), rows[some]
+            found[CellKey(int(cell))] = Evidence(places[start:stop], counts[start:stop], sampled, rows)
+        return found
 
 
-def seen_voxels(
-    origin_m: Floats, ends_m: Floats, ends: Ints, geometry: Geometry, *, hits: Ints | None = None
-) -> SeenVoxels:
-    """Voxels that rays from one origin hit or passed.
+class Samples:
+    """Sums of samples of the voxels that a scan hit, by cell, rising in place."""
+
+    def __init__(self, voxels: Ints, sums: Ints, geometry: Geometry) -> None:
+        """Args: voxels: (U, 3) numbers, all different. sums: (U, P) of them."""
+        cells, places = split_voxels(voxels, geometry)
+        order = np.lexsort((places, cells))
+        self._cells, self._sums = cells[order], sums[order]
+
+    def of(self, cell: np.uint64) -> Ints:
+        """(U, P) sums of the voxels in a cell."""
+        return self._sums[slice(*np.searchsorted(self._cells, [cell, cell + np.uint64(1)]))]
+
+
+def seen_bricks(origin_m: Floats, hits: Ints, clear_m: Floats, geometry: Geometry) -> SeenBricks:
+    """Bricks whose voxels rays from one origin hit or passed.
 
     Args:
         origin_m: (3,) metres, map frame.
-        ends_m: (N, 3) metres, map frame: one end point in each voxel of `ends`.
-        ends: (N, 3) voxel numbers, all different.
+        hits: (M, 3) voxels that were hit; any may come several times.
+        clear_m: (N, 3) metres, map frame: ends of the rays. Of those that end in one voxel the first is cast. A ray
+            counts nothing in the voxel where it ends: if none was hit there, it is clear only so far.
         geometry: of the map.
-        hits: (M, 3) voxels that were hit, all different; None: those where the rays end. A ray that ends in a voxel
-            which was not hit, because it is clear only so far, counts nothing in that voxel.
 
     Raises:
-        BadInputError: the scan spans more bricks than fit in memory; limit the range or coarsen the map.
+        BadInputError: the scan reaches beyond the numbered space, or spans more bricks than fit in memory; limit the
+            range or coarsen the map.
     """
     # Stage 1: the box of bricks around all rays and hits.
-    start = voxels_of_points(origin_m, geometry)
-    struck = ends if hits is None else hits
-    reached = np.concatenate([ends, struck, start])
-    low, high = reached.min(axis=0) >> BRICK_DEPTH, reached.max(axis=0) >> BRICK_DEPTH
+    start, ends = voxels_of_points(origin_m, geometry), voxels_of_points(clear_m, geometry)
+    reached = [each for each in (ends, hits, start) if len(each)]
+    low = np.min([each.min(axis=0) for each in reached], axis=0) >> BRICK_DEPTH
+    high = np.max([each.max(axis=0) for each in reached], axis=0) >> BRICK_DEPTH
     dims = high - low + 1
     if float(np.prod(dims.astype(np.float64))) > BOX_BRICKS_MAX:
         size_m = dims * 8 * geometry.voxel_edge_m
@@ -73,20 +123,23 @@ def seen_voxels(
     # Stage 2: a dense index of the box's bricks, and a pool of marks for those that are touched.
     corner = low << BRICK_DEPTH
     brick_of = np.full(int(np.prod(dims)), -1, np.int32)
-    bricks = np.empty(len(struck) + 1024, np.int64)
+    bricks = np.empty(min(len(brick_of), len(hits) + len(ends)) + 1024, np.int64)
     marks = np.empty((len(bricks), 512), np.uint8)
+    firsts = np.empty(max(len(hits), len(ends)), np.int64)
+    # Stage 3: voxels that were hit, and one ray for each voxel in which clear parts end.
+    used, _ = mark_ends_into(hits - corner, HIT, dims, brick_of, bricks, marks, 0, firsts)
     box_ends = ends - corner
+    used, count = mark_ends_into(box_ends, END, dims, brick_of, bricks, marks, used, firsts)
+    # Stage 4: the rays, with a larger pool whenever one might not fit.
     origin = _inside(origin_m, start[0], geometry) - corner
-    targets = ends_m / geometry.voxel_edge_m - corner
-    # Stage 3: hits first, since they win over misses; then rays, with a larger pool whenever one might not fit.
-    used = mark_hits_into(struck - corner, dims, brick_of, bricks, marks, 0)
+    targets, rays = clear_m / geometry.voxel_edge_m - corner, firsts[:count]
     ray = 0
-    while ray < len(ends):
-        ray, used = mark_misses_into(origin, targets, box_ends, ray, dims, brick_of, bricks, marks, used)
-        if ray < len(ends):
+    while ray < count:
+        ray, used = mark_misses_into(origin, targets, box_ends, rays, ray, dims, brick_of, bricks, marks, used)
+        if ray < count:
             room = len(bricks) + max(len(bricks) // 2, int(dims.sum()) + 1)
             bricks, marks = np.resize(bricks, room), _with_room(marks, room, used)
-    return _by_cell(bricks[:used], marks[:used], dims, low, geometry)
+    return _in_order(bricks[:used], marks, dims, low, geometry)
 
 
 def _inside(origin_m: Floats, start: Ints, geometry: Geometry) -> Floats:
@@ -96,35 +149,36 @@ def _inside(origin_m: Floats, start: Ints, geometry: Geometry) -> Floats:
     return inside
 
 
-def _with_room(marks: npt.NDArray[np.uint8], room: int, used: int) -> npt.NDArray[np.uint8]:
+def _with_room(marks: Marks, room: int, used: int) -> Marks:
     grown = np.empty((room, 512), np.uint8)
     grown[:used] = marks[:used]
     return grown
 
 
-def _by_cell(bricks: Ints, marks: npt.NDArray[np.uint8], dims: Ints, low: Ints, geometry: Geometry) -> SeenVoxels:
-    # Coordinates of the bricks; then marks in order of cell and Morton place.
+def _in_order(bricks: Ints, marks: Marks, dims: Ints, low: Ints, geometry: Geometry) -> SeenBricks:
+    # Coordinates of the bricks; then their order by cell and Morton number.
     xyz = np.stack([bricks % dims[0], bricks // dims[0] % dims[1], bricks // (dims[0] * dims[1])], axis=1) + low
     up = geometry.depth - BRICK_DEPTH
     cells = interleave((xyz >> up) + CELL_LIMIT)
     numbers = interleave(xyz & ((1 << up) - 1)).astype(np.uint32)
     order = np.lexsort((numbers, cells))
-    marks = marks[order]
-    row, inner = np.nonzero(marks)
-    places = (numbers[order][row] << np.uint32(9)) | inner.astype(np.uint32)
-    return SeenVoxels(cells[order][row], places, marks[row, inner] == HIT)
+    return SeenBricks(cells[order], numbers[order], order, marks)
 
 
 def clear_ends(
     origin_m: Floats, points_map: Floats, sigma_m: Floats, *, voxel_edge_m: float, noise_sigmas: float
 ) -> Floats:
     """(M, 3) ends of the clear part of beams to (N, 3) points, metres; without beams that are not clear at all."""
-    # Shorter by the margin; what is left may be nothing.
-    beams = points_map - origin_m
-    range_m = np.linalg.norm(beams, axis=1)
-    left_m = range_m - margins_m(sigma_m, voxel_edge_m=voxel_edge_m, noise_sigmas=noise_sigmas)
-    some = left_m > 0
-    return np.asarray(origin_m + beams[some] * (left_m[some] / range_m[some])[:, None])
+    margin_m = margins_m(sigma_m, voxel_edge_m=voxel_edge_m, noise_sigmas=noise_sigmas)
+    ends = np.empty(points_map.shape)
+    return ends[: clear_ends_into(origin_m, points_map, margin_m.astype(np.float64), ends)]
+
+
+def carried(points: Floats, T_map_sensor: Transform) -> Floats:
+    """(N, 3) points of a sensor, in the map's frame."""
+    out = np.empty(points.shape)
+    carry_into(points, T_map_sensor, out)
+    return out
 
 
 def silent_ends(returns: Returns, rays: Floats) -> Floats:
@@ -136,7 +190,7 @@ def silent_ends(returns: Returns, rays: Floats) -> Floats:
 
 
 def beam_evidence(
-    origin_m: Floats, points_map: Floats, clear_m: Floats, geometry: Geometry, *, sums_of: Sums
+    origin_m: Floats, points_map: Floats, clear_m: Floats, geometry: Geometry, *, sums_of: Sums | None
 ) -> dict[CellKey, Evidence]:
     """The evidence of beams from one place, by cell.
 
@@ -145,45 +199,29 @@ def beam_evidence(
         points_map: (N, 3) their ends, metres.
         clear_m: (M, 3) ends of their clear parts, metres.
         geometry: of the map.
-        sums_of: samples of the voxels that were hit.
+        sums_of: samples of the voxels that were hit; None: there are none.
 
     Raises:
         BadInputError: they reach beyond the numbered space, or span more than fits in memory.
     """
-    # One ray for each voxel in which clear parts end.
-    hits, _, voxel_of = unique_voxels(voxels_of_points(points_map, geometry))
-    targets, first, _ = unique_voxels(voxels_of_points(clear_m, geometry))
-    seen = seen_voxels(origin_m, clear_m[first], targets, geometry, hits=hits)
-    return _packed_by_cell(seen, hits, sums_of(voxel_of, len(hits)), geometry)
+    # Voxels need numbers only where there are samples to be summed up for each.
+    hits = voxels_of_points(points_map, geometry)
+    seen = seen_bricks(origin_m, hits, clear_m, geometry)
+    if sums_of is None or not geometry.plane_count:
+        return seen.evidence(None, geometry)
+    different, voxel_of = unique_voxels(hits)
+    sums = sums_of(voxel_of, len(different))
+    return seen.evidence(Samples(different, sums, geometry) if sums.any() else None, geometry)
 
 
-def unique_voxels(voxels: Ints) -> tuple[Ints, Ints, Ints]:
-    """Different voxels (U, 3), the first point in each (U,), and the number of each point's voxel (N,)."""
+def unique_voxels(voxels: Ints) -> tuple[Ints, Ints]:
+    """Different voxels (U, 3), and the number of each point's voxel (N,)."""
     if not len(voxels):
-        return voxels, np.empty(0, np.int64), np.empty(0, np.int64)
+        return voxels, np.empty(0, np.int64)
     # One number a voxel, by its place in the box of all of them.
     low = voxels.min(axis=0)
     span = voxels.max(axis=0) - low + 1
     shifted = voxels - low
     flat = (shifted[:, 2] * span[1] + shifted[:, 1]) * span[0] + shifted[:, 0]
     _, first, voxel_of = np.unique(flat, return_index=True, return_inverse=True)
-    return voxels[first], first, voxel_of
-
-
-def _packed_by_cell(seen: SeenVoxels, ends: Ints, samples: Ints, geometry: Geometry) -> dict[CellKey, Evidence]:
-    end_cells, end_places = split_voxels(ends, geometry)
-    order = np.lexsort((end_places, end_cells))
-    end_cells, end_places, samples = end_cells[order], end_places[order], samples[order]
-    # Both are in order of cell and place, so a cell is one slice of each.
-    cells, starts = np.unique(seen.cells, return_index=True)
-    bounds = np.append(starts, len(seen.cells))
-    packed: dict[CellKey, Evidence] = {}
-    for cell, start, stop in zip(cells, bounds[:-1], bounds[1:], strict=True):
-        hit = seen.hit[start:stop]
-        mine = slice(*np.searchsorted(end_cells, [cell, cell + np.uint64(1)]))
-        full = np.zeros((stop - start, geometry.plane_count), np.int64)
-        # Hits and end points of a cell are the same voxels in the same order.
-        full[hit] = samples[mine]
-        counts = np.stack([hit, ~hit], axis=1).astype(np.int32)
-        packed[CellKey(int(cell))] = packed_evidence(seen.places[start:stop], counts, full, geometry)
-    return packed
+    return voxels[first], voxel_of

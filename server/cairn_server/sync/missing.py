@@ -181,9 +181,9 @@ def header_of(
     )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class CellFrames:
-    """Frames of single cells for one asker, all from one snapshot."""
+    """Frames of single cells for one asker, all from one state."""
 
     snapshot: Snapshot
     query: MissingQuery
@@ -191,6 +191,10 @@ class CellFrames:
     cache: ReadCache
     faults: CellFaults
     """Cells met on the way that are damaged, or away; filled here."""
+
+    def read_from(self, snapshot: Snapshot, faults: CellFaults) -> None:
+        """Read from another snapshot of the same state from here on."""
+        self.snapshot, self.faults = snapshot, faults
 
     def frame_of(self, row: CellRow, start: Cursor | None) -> CellFrame | None:
         """Smallest frame that brings a cell from the asker's state `start` to this one; None: it has that state."""
@@ -260,7 +264,7 @@ def reply_frames(cells: CellFrames, facts: HeaderFacts) -> Iterator[Frame | Empt
     """Header, frames of the cells that the asker misses, and the end of a reply."""
     snapshot, query, listed = cells.snapshot, cells.query, cells.query.listed
     to = str(snapshot.head)
-    # All from one snapshot (rule 3): what is folded meanwhile is wholly in the next reply.
+    # All from one state (rule 3): what is folded meanwhile is wholly in the next reply.
     yield header_of(snapshot, query.author, facts, since=query.since)
     # Every cell of main: a frame, or its fingerprint in `rest`, so that the asker can check the whole map.
     rest = snapshot.fingerprint_sum(query.box)

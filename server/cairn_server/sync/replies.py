@@ -1,17 +1,17 @@
 """Answers about the state of main: replies to fetch-missing, the cell index, the version vector at a cursor."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
 
 from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.ids import Author
 from cairn_map.commits.version_vector import VersionVector
 from cairn_map.errors import ConflictError, NotFoundError
-from cairn_map.wire.empty_cell_frames import EmptyCellFrames
-from cairn_map.wire.frames import Frame, encode_frame, start_of_reply
 from cairn_map.wire.messages import CellIndex
 from cairn_map.wire.resumed_replies import reply_digest, without_begun
 from cairn_server.folding.cell_index import FIRST_PAGE, IndexPage, entries_of
-from cairn_server.folding.cells import Cells
+from cairn_server.folding.cells import CellFaults, Cells
 from cairn_server.folding.read_cache import ReadCache
 from cairn_server.live.hub import Hub
 from cairn_server.metrics import ServerFigures
@@ -22,6 +22,7 @@ from cairn_server.store.store_rows import MapRow
 from cairn_server.sync.asked_cells import Asked
 from cairn_server.sync.held_commits import WantedCommits
 from cairn_server.sync.missing import CellFrames, HeaderFacts, header_of, proven_since, query_of, reply_frames
+from cairn_server.sync.reply_parts import MissingReply, ReplyParts
 from cairn_server.sync.slices import SLICES_OF_DATABASE, SLICES_OF_FILE, Slices
 
 
@@ -62,27 +63,36 @@ class MainReplies:
         self._cache = ReadCache(share=cache_share)
         self._slices = Slices(SLICES_OF_FILE if store.replicas is None else SLICES_OF_DATABASE)
 
-    def missing(self, row: MapRow, branch: str, asked: Asked) -> bytes:
-        """Frames that bring the asker to the head, wholly in memory before they are sent.
+    def missing(self, row: MapRow, branch: str, asked: Asked) -> MissingReply:
+        """Frames that bring the asker to the head: the first part, and the others as they are read.
 
         Empty if the asker says that it knows this very reply.
         """
-        # All from one snapshot (rule 3), and joined before anything is sent: a slow link must not keep a snapshot open,
-        # which holds up the emptying of the store's log.
-        with self._slices.turn(), self._cells.reading(row) as faults, self._store.snapshot(row) as snapshot:
+        reading = partial(self._reading, row)
+        # Each part is read before it is sent: a slow link must not keep a snapshot open, which holds up the emptying of
+        # the store's log.
+        with self._slices.turn(), reading() as (snapshot, faults):
             query = query_of(asked, snapshot)
             cells = CellFrames(snapshot, query, row.layer, self._cache, faults)
             frames = without_begun(reply_frames(cells, self._facts(row, snapshot)), asked.request.begun)
-            reply = b"".join([start_of_reply(), *self._slices.of(_encoded(self._figures.counted(frames)))])
+            parts = ReplyParts(cells, self._figures.counted(frames), self._slices)
+            first = parts.read()
         # For the list of branches and their expiry: what the server sends never depends on it.
         self._store.seen(row, branch, query.cursor)
         if query.cursor is None:
             self._hub.robot_heard(row, branch)
         else:
             self._hub.robot_heard(row, branch, cursor=str(query.cursor))
+        if not parts.is_whole:
+            return MissingReply(first, parts.others(reading))
         # The digest is of the whole reply: this saves the link's bytes, not the work.
         known = asked.request.known
-        return b"" if known is not None and known == reply_digest(reply) else reply
+        return MissingReply(b"" if known is not None and known == reply_digest(first) else first, None)
+
+    @contextmanager
+    def _reading(self, row: MapRow) -> Iterator[tuple[Snapshot, CellFaults]]:
+        with self._cells.reading(row) as faults, self._store.snapshot(row) as snapshot:
+            yield snapshot, faults
 
     def cell_index(
         self, row: MapRow, author: Author | None, page: IndexPage = FIRST_PAGE, *, since: str | None = None
@@ -113,11 +123,3 @@ class MainReplies:
 
     def _facts(self, row: MapRow, snapshot: Snapshot) -> HeaderFacts:
         return HeaderFacts(self._stable.of(snapshot), self._cells.damaged(row), self._wanted.of(row.name))
-
-
-def _encoded(frames: Iterable[Frame | EmptyCellFrames]) -> Iterator[bytes]:
-    for frame in frames:
-        if isinstance(frame, EmptyCellFrames):
-            yield from frame.encoded()
-        else:
-            yield encode_frame(frame)

@@ -68,7 +68,7 @@ def test_a_folder_from_before_ages_opens_and_its_commits_count_from_then(tmp_pat
     mole.close()
     with closing(apsw.Connection(str(tmp_path / FILE_NAME))) as old:
         old.execute("ALTER TABLE commits DROP COLUMN acked_age_s; ALTER TABLE commits DROP COLUMN epoch")
-        old.execute("DELETE FROM meta WHERE key = 'age_s'")
+        old.execute("DROP TABLE delta; DELETE FROM meta WHERE key = 'age_s'")
         old.execute("ALTER TABLE commits DROP COLUMN seal" if version == 1 else "")
         old.execute(f"PRAGMA user_version = {version}")
     mole = opened(tmp_path, clock)

@@ -109,8 +109,9 @@ def test_commits_that_come_after_each_other_end_in_an_error(tmp_path: Path) -> N
 def test_files_of_all_versions_have_the_form_that_is_checked(tmp_path: Path) -> None:
     assert set(STEPS) == set(range(1, VERSION))
     for version in range(1, VERSION + 1):
-        later = [name for (_, name), since in COLUMNS_SINCE.items() if since > version]
-        drops = [f"ALTER TABLE commits DROP COLUMN {name}" for name in later]
+        later = [(table, name) for (table, name), since in COLUMNS_SINCE.items() if since > version]
+        drops = [f"ALTER TABLE commits DROP COLUMN {name}" for table, name in later if table == "commits"]
+        drops += ["DROP TABLE delta"] if any(table == "delta" for table, _ in later) else []
         folder = changed(tmp_path / str(version), *drops, f"PRAGMA user_version = {version}")
         assert glance(folder).commits == ()
         open_and_read(folder)

@@ -6,8 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.naive import rays as naive_rays
 
-from cairn_fusion.mapping.ray_casting import SeenVoxels, seen_voxels
+from cairn_fusion.mapping.cast_kernels import HIT, MISS
+from cairn_fusion.mapping.ray_casting import SeenBricks, beam_evidence, seen_bricks, unique_voxels
 from cairn_map.errors import BadInputError
+from cairn_map.evidence.evidence import packed_evidence
 from cairn_map.evidence.grid import Geometry, voxels_in_cell, voxels_of_points
 
 law = settings(max_examples=50, deadline=None, database=None)  # the first call of a kernel compiles it
@@ -24,22 +26,34 @@ coordinates = st.one_of(
 points = st.tuples(coordinates, coordinates, coordinates)
 
 
-def cast(origin: Voxel, targets: list[tuple[float, ...]]) -> tuple[SeenVoxels, np.ndarray, np.ndarray]:  # type: ignore[type-arg]
+def cast(origin: Voxel, targets: list[tuple[float, ...]]) -> tuple[SeenBricks, np.ndarray, np.ndarray]:  # type: ignore[type-arg]
     """Rays to targets in voxels; and which targets were taken, one for each end voxel."""
     ends_m = np.array(targets, dtype=np.float64).reshape(-1, 3) * EDGE_M
     voxels, first = np.unique(voxels_of_points(ends_m, GEOMETRY), axis=0, return_index=True)
-    return seen_voxels(np.array(origin) * EDGE_M, ends_m[first], voxels, GEOMETRY), ends_m[first], voxels
+    first = np.sort(first)
+    every = voxels_of_points(ends_m, GEOMETRY)
+    return seen_bricks(np.array(origin) * EDGE_M, every, ends_m, GEOMETRY), ends_m[first], voxels
 
 
-def as_sets(seen: SeenVoxels) -> tuple[set[Voxel], set[Voxel]]:
+def as_sets(seen: SeenBricks) -> tuple[set[Voxel], set[Voxel]]:
     """Hits and misses as voxel numbers; no voxel may be there twice."""
     hits: set[Voxel] = set()
     misses: set[Voxel] = set()
-    for cell, place, hit in zip(seen.cells, seen.places, seen.hit, strict=True):
-        (voxel,) = voxels_in_cell(np.array([place]), int(cell), GEOMETRY)
+    for cell, place, hit in marked(seen):
+        (voxel,) = voxels_in_cell(np.array([place]), cell, GEOMETRY)
         (hits if hit else misses).add(tuple(voxel.tolist()))
-    assert len(hits) + len(misses) == len(seen.cells)
+    assert len(hits) + len(misses) == len(marked(seen))
     return hits, misses
+
+
+def marked(seen: SeenBricks) -> list[tuple[int, int, bool]]:
+    """Cell and place of each voxel that was passed or hit, and which it was, brick by brick."""
+    found = []
+    for cell, number, slot in zip(seen.cells, seen.numbers, seen.slots, strict=True):
+        for inner, mark in enumerate(seen.marks[slot].tolist()):
+            if mark & (HIT | MISS):
+                found.append((int(cell), int(number) * 512 + inner, bool(mark & HIT)))
+    return found
 
 
 def check_against_twin(origin: tuple[float, ...], targets: list[tuple[float, ...]]) -> None:
@@ -95,10 +109,10 @@ def test_the_order_of_rays_changes_nothing(origin: tuple[float, ...], targets: l
     random.shuffle(order)  # type: ignore[attr-defined]
     origin_m = np.array(origin) * EDGE_M
     one, other = (
-        seen_voxels(origin_m, ends_m, voxels, GEOMETRY),
-        seen_voxels(origin_m, ends_m[order], voxels[order], GEOMETRY),
+        seen_bricks(origin_m, voxels, ends_m, GEOMETRY),
+        seen_bricks(origin_m, voxels[order], ends_m[order], GEOMETRY),
     )
-    assert all(np.array_equal(getattr(one, name), getattr(other, name)) for name in ("cells", "places", "hit"))
+    assert marked(one) == marked(other)
 
 
 def test_a_hit_is_never_overruled_by_a_ray_that_passes_it() -> None:
@@ -119,14 +133,44 @@ def test_a_ray_of_no_length_is_a_hit_where_it_is() -> None:
 
 
 def test_no_rays_see_nothing() -> None:
-    assert len(cast((0.5, 0.5, 0.5), [])[0].cells) == 0
+    assert marked(cast((0.5, 0.5, 0.5), [])[0]) == []
 
 
 def test_cells_and_places_rise() -> None:
     rng = np.random.default_rng(1)
     seen, _, _ = cast((0.1, 0.2, 0.3), [tuple(p) for p in rng.uniform(-40, 40, (200, 3))])
-    keys = [(int(cell), int(place)) for cell, place in zip(seen.cells, seen.places, strict=True)]
+    keys = [(cell, place) for cell, place, _ in marked(seen)]
     assert keys == sorted(set(keys))
+
+
+@pytest.mark.parametrize("with_samples", [False, True])
+def test_evidence_is_that_of_the_marks_packed_voxel_by_voxel(with_samples: bool) -> None:
+    rng = np.random.default_rng(3)
+    geometry = Geometry(voxel_edge_um=100_000, depth=4)
+    points_m = rng.uniform(-3, 3, (300, 3)).round(1)
+    clear_m = 0.9 * points_m
+    sums = rng.integers(0, 2, (300, geometry.plane_count)) * rng.integers(1, 9, (300, geometry.plane_count))
+    found = beam_evidence(
+        np.array([0.1, 0.2, 0.3]),
+        points_m,
+        clear_m,
+        geometry,
+        sums_of=(lambda _, count: sums[:count]) if with_samples else None,
+    )
+    voxels, voxel_of = unique_voxels(voxels_of_points(points_m, geometry))
+    assert (voxels[voxel_of] == voxels_of_points(points_m, geometry)).all()
+    sums_at = dict(zip(map(tuple, voxels.tolist()), sums, strict=False))
+    seen = seen_bricks(np.array([0.1, 0.2, 0.3]), voxels_of_points(points_m, geometry), clear_m, geometry)
+    expected: dict[int, list[tuple[int, bool, np.ndarray]]] = {}  # type: ignore[type-arg]
+    for cell, place, hit in marked(seen):
+        (voxel,) = voxels_in_cell(np.array([place]), cell, geometry)
+        row = sums_at[tuple(voxel.tolist())] if hit and with_samples else np.zeros(geometry.plane_count, np.int64)
+        expected.setdefault(cell, []).append((place, hit, row))
+    assert found.keys() == expected.keys()
+    for key, rows in expected.items():
+        places, hits, samples = zip(*rows, strict=True)
+        counts = np.array([[hit, not hit] for hit in hits], np.int32)
+        assert found[key] == packed_evidence(np.array(places, np.uint32), counts, np.array(samples), geometry)  # type: ignore[index]
 
 
 def test_many_long_rays_make_the_pool_grow_and_agree_with_the_twin() -> None:
@@ -143,4 +187,4 @@ def test_a_scan_that_would_not_fit_in_memory_is_refused() -> None:
     fine = Geometry(voxel_edge_um=1000, depth=3, channels=())
     ends_m = np.array([[9.0, 9.0, 9.0]])
     with pytest.raises(BadInputError):
-        seen_voxels(np.zeros(3), ends_m, voxels_of_points(ends_m, fine), fine)
+        seen_bricks(np.zeros(3), voxels_of_points(ends_m, fine), ends_m, fine)

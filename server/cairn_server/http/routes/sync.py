@@ -3,6 +3,7 @@
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Header, Query, Response
+from fastapi.responses import StreamingResponse
 from starlette.concurrency import run_in_threadpool
 
 from cairn_map.commits.signature import TEXT_MAX
@@ -94,10 +95,14 @@ def missing(
     visit: Annotated[Visit, Depends(visiting_owner)],
     asked: Annotated[Asked, json_of(MissingRequest, asked_of)],
 ) -> Response:
-    """Frames that bring the caller to the head; 204 if they are those of the last reply."""
+    """Frames that bring the caller to the head, sent as they are read; 204 if they are those of the last reply."""
     require_format(visit.row, visit.format)
     reply = visit.service.sync.replies.missing(visit.row, branch, asked)
-    return Response(reply, media_type=REPLY_MEDIA_TYPE) if reply else Response(status_code=204)
+    if not reply.first:
+        return Response(status_code=204)
+    if reply.rest is None:
+        return Response(reply.first, media_type=REPLY_MEDIA_TYPE)
+    return StreamingResponse(reply.parts(), media_type=REPLY_MEDIA_TYPE)
 
 
 async def author(commit: str, caller: Annotated[Caller, Depends(allowed(Role.ROBOT, Role.RELAY))]) -> Caller:
