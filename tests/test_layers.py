@@ -118,7 +118,7 @@ ROOMS = {
     """,
     "cairn_calib": "rig board board.discs exchange corner_search solve diagnosis report thermal verify cli",
     "cairn_fusion": "recording clouds ros transfer mapping image_fusion view importers warm_up",
-    "cairn_client": "replica sync http relay robot folders publish live cli cli.maps cli.robots main",
+    "cairn_client": "replica sync http relay robot folders publish live cli cli.doctor cli.maps cli.robots main",
     "cairn_sim": "scene render robots evaluation experiment study demo sim_command warm_up",
     "cairn_server": """
         memory_shares cell_room settings processes map_refusals

@@ -15,9 +15,9 @@ from tests.fixtures.server.live import Live
 from tests.fixtures.server.pushes import pushed
 from tests.fixtures.server.replicas import SharedMemoryStore
 
-from cairn_client.cli.doctor import main
-from cairn_client.cli.doctor_checks import CheckResult, clock_check, grid_check
-from cairn_client.cli.doctor_site import checks_of
+from cairn_client.cli.doctor.checks import CheckResult, clock_check, grid_check
+from cairn_client.cli.doctor.command import main
+from cairn_client.cli.doctor.site import checks_of
 from cairn_client.folders.map_copy import clone
 from cairn_client.http.api import MapApi
 from cairn_client.robot.robot import Robot

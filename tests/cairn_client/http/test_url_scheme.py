@@ -13,7 +13,7 @@ from tests.fixtures.commands import cairn
 from tests.fixtures.server.certificate import certificate
 from tests.fixtures.server.live import Process
 
-from cairn_client.cli.doctor_checks import CheckResult, certificate_check
+from cairn_client.cli.doctor.checks import CheckResult, certificate_check
 from cairn_client.http import api as client_api
 from cairn_client.http.api import MapApi
 from cairn_client.http.url_scheme import unreachable

@@ -10,7 +10,7 @@ from tests.fixtures.server.access import bearer
 from tests.fixtures.server.live import free_port, until
 from tests.fixtures.server.prometheus_text import families_of
 
-from cairn_client.cli.doctor import main as doctor
+from cairn_client.cli.doctor.command import main as doctor
 from cairn_client.relay.upstream import Upstream
 from cairn_map.errors import DeniedError, UnreachableError
 from cairn_map.wire.messages import CreateMap

@@ -31,7 +31,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cairn_client.cli.arguments import add_token, parser, say
-from cairn_client.cli.doctor_checks import (
+from cairn_client.cli.doctor.checks import (
     Check,
     CheckResult,
     disk_check,
@@ -40,7 +40,7 @@ from cairn_client.cli.doctor_checks import (
     installation_checks,
     server_checks,
 )
-from cairn_client.cli.doctor_site import site_checks
+from cairn_client.cli.doctor.site import site_checks
 from cairn_client.folders.state_folder import opened_replica
 from cairn_client.http.api import MapApi
 from cairn_client.http.map_url import split_map_url

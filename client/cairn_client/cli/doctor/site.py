@@ -7,7 +7,7 @@ its servers. One that sends a client to the same server each time needs the serv
 from collections import Counter
 from collections.abc import Iterator, Sequence
 
-from cairn_client.cli.doctor_checks import Check, CheckResult
+from cairn_client.cli.doctor.checks import Check, CheckResult
 from cairn_client.http.api import MapApi
 from cairn_map.errors import CairnError, DeniedError, NotFoundError
 from cairn_map.wire.access_messages import ServerInfo, SiteInfo
