@@ -41,7 +41,7 @@ IS_LACKING = (
 
 
 class Database(Protocol):
-    """What these rows need of a database."""
+    """Part of a database that these rows need: transactions and readings."""
 
     def run(self, job: Callable[[Query], T]) -> T:
         """Result of a job in one transaction, durable on return."""
