@@ -59,6 +59,7 @@ from cairn_server.sync.attachment_transfer import AttachmentTransfer
 from cairn_server.sync.clock_trust import ClockTrust
 from cairn_server.sync.handing_over import UpstreamProgress
 from cairn_server.sync.held_commits import HeldCommits, WantedCommits
+from cairn_server.sync.map_layers import MapLayers
 from cairn_server.sync.marking import Marking
 from cairn_server.sync.operator_commits import OperatorCommits
 from cairn_server.sync.pushes import Pushes
@@ -87,6 +88,7 @@ class SyncParts:
     uploads: Uploads
     retracts: Retracts
     marking: Marking
+    layers: MapLayers
     attachments: AttachmentTransfer
     replies: MainReplies
     held: HeldCommits
@@ -188,6 +190,7 @@ class Service:
             Uploads(store, pushes),
             Retracts(store, commits, wanted, on_new=on_new),
             Marking(store, commits, on_new=on_new),
+            MapLayers(store, commits, settings.memory, info=self.maps.info, on_new=on_new),
             AttachmentTransfer(store.attachments),
             MainReplies(
                 store,

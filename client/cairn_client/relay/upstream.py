@@ -14,6 +14,7 @@ from cairn_client.http.request_deadline import PACE, Pace
 from cairn_client.relay.carried_attachments import hand_over_attachments
 from cairn_client.relay.link import RelayApi, ServerEnd, hold_between
 from cairn_client.relay.round import RelayReport, RelaySide, Undelivered, log_report, relay_round
+from cairn_map.commits.ids import map_of_layer
 from cairn_map.errors import CairnError, DeniedError, NotFoundError, UnreachableError
 from cairn_map.wire.messages import MapInfo
 from cairn_map.wire.relay_peer import TOO_MANY_MAPS, OwnServer
@@ -102,7 +103,9 @@ class Upstream:
         own = set(self._server.map_names())
         for name in sorted(own - {info.name for info in found}):
             self._server.note_round(name, NotFoundError("no_map", "the upstream server has no such map for this token"))
-            self._say(logging.WARNING, f"upstream {self._url} has no map {name} for this token; create it there")
+            # A layer comes there with the commit of its map that defines it.
+            if map_of_layer(name) is None:
+                self._say(logging.WARNING, f"upstream {self._url} has no map {name} for this token; create it there")
         has_more, cut, is_full = False, None, False
         refused: list[tuple[str, CairnError]] = []
         for info in found:

@@ -17,6 +17,7 @@ from cairn_client.http.attachment_copy import attachment_bytes
 from cairn_client.replica.outbox import CommitFacts
 from cairn_client.replica.replica import Replica
 from cairn_client.robot.kept_scans import KeptScans
+from cairn_client.robot.map_marks import check_has_marks
 from cairn_fusion.mapping.measurement import Measurement
 from cairn_fusion.recording.scan import Scan
 from cairn_fusion.recording.scan_bytes import move_scan
@@ -98,6 +99,7 @@ class Amending:
 
     def mark(self, mark: Mark, *, instead_of: AnyCommit | None, attachment: Path | bytes | None) -> Commit:
         """Commit a mark, perhaps in the place of an own one; as `Robot.mark`."""
+        check_has_marks(self._replica.state.map_name or "")
         check_place(mark, self._replica.geometry)
         attached = attachment_bytes(attachment)
         if attached:

@@ -476,7 +476,7 @@ class Robot:
             instead_of: commit of an own mark that it takes the place of; `retract` takes one out.
 
         Raises:
-            BadInputError: kind `bad_mark`, `bad_place`, `bad_attachment`, or `not_own`: another's, for an operator.
+            BadInputError: kind `bad_mark`, `bad_place`, `bad_attachment`, `layer_of_map`; `not_own`: another's mark.
             CairnError: kind `no_mark` or `taken_back`: of `instead_of`; `store_failed`, `outbox_full`; or the server's.
         """
         time_s = self._clock.best_s()  # the server's, if it was learnt

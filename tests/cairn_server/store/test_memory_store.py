@@ -18,6 +18,7 @@ from tests.fixtures.server.deletion_contract import DeletionContract
 from tests.fixtures.server.epoch_contract import EpochContract
 from tests.fixtures.server.evidence_contract import EvidenceContract
 from tests.fixtures.server.fetching import fetch
+from tests.fixtures.server.layer_contract import LayerContract
 from tests.fixtures.server.live import Live
 from tests.fixtures.server.mark_contract import MarkContract
 from tests.fixtures.server.pushes import MOLE, WREN, pushed, read, sum_of
@@ -54,6 +55,7 @@ class TestMemoryStore(
     EvidenceContract,
     EpochContract,
     MarkContract,
+    LayerContract,
     AttachmentContract,
     BranchContract,
     AccessContract,

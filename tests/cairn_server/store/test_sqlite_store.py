@@ -22,6 +22,7 @@ from tests.fixtures.server.crowd_contract import CrowdContract
 from tests.fixtures.server.deletion_contract import DeletionContract
 from tests.fixtures.server.epoch_contract import EpochContract
 from tests.fixtures.server.evidence_contract import EvidenceContract
+from tests.fixtures.server.layer_contract import LayerContract
 from tests.fixtures.server.mark_contract import MarkContract
 from tests.fixtures.server.pushes import MOLE, WREN, pushed
 from tests.fixtures.server.shares_contract import SharesContract, author_of
@@ -74,6 +75,7 @@ class TestSqliteStore(
     EvidenceContract,
     EpochContract,
     MarkContract,
+    LayerContract,
     AttachmentContract,
     BranchContract,
     AccessContract,

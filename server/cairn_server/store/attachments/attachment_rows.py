@@ -41,7 +41,7 @@ IS_LACKING = (
 
 
 class Database(Protocol):
-    """Part of a database that these rows need: transactions and readings."""
+    """Part of a database that these rows use."""
 
     def run(self, job: Callable[[Query], T]) -> T:
         """Result of a job in one transaction, durable on return."""

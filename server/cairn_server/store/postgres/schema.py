@@ -403,6 +403,10 @@ CREATE TABLE mark (
 CREATE INDEX mark_changed ON mark (map, changed_seq, low_x, low_y, low_z, high_x, high_y, high_z);
 ALTER TABLE author ADD COLUMN marks bigint NOT NULL DEFAULT 0;          -- of its commits, that are not taken out
 """
+LAYERS = "COMMENT ON COLUMN map.name IS 'of a map, or MAP.LAYER: of a further layer of one'"
+LAYERS_OLDEST = 11
+"""Oldest step whose programs work on a store with maps of several layers: others take the commit that defines one for
+damaged, and its name for none of a map."""
 MARKS_OLDEST = 10
 """Oldest step whose programs work on a store with marks: others take a commit with marks for a damaged one."""
 ATTACHMENTS = """
@@ -429,7 +433,7 @@ CREATE TABLE attachment_part (
 );
 ALTER TABLE attachment_part ALTER COLUMN body SET STORAGE EXTERNAL;     -- pictures do not shrink
 """
-ATTACHMENTS_OLDEST = 11
+ATTACHMENTS_OLDEST = 12
 """Oldest step whose programs read a mark with an attachment."""
 BOUND_OLDEST = 4
 """Oldest step whose programs read a store of which bytes are in an object store."""
@@ -446,7 +450,10 @@ class Step:
 
 STEPS = tuple(
     Step(sql, oldest=1)
-    for sql in (FIRST, REPLICAS, SERVERS, OBJECTS, OWNED_OBJECTS, EPOCHS, CLOCK, ADDRESSES, GONE, MARKS, ATTACHMENTS)
+    for sql in (
+        *(FIRST, REPLICAS, SERVERS, OBJECTS, OWNED_OBJECTS, EPOCHS, CLOCK, ADDRESSES, GONE, MARKS, LAYERS),
+        ATTACHMENTS,
+    )
 )
 
 

@@ -162,16 +162,21 @@ def next_map_number(connection: apsw.Connection) -> int:
 
 
 def delete_map(connection: apsw.Connection, row: MapRow, ended: EndedTokens, *, by: str) -> GoneMap:
-    """End a map and its tokens inside a transaction; its rows stay (`clear_part`)."""
+    """End a map, its layers and their tokens inside a transaction; their rows stay (`clear_part`)."""
     check_lives(connection, row.number)
-    gone = GoneMap(number=row.number, name=row.name, deleted_s=time.time(), by=by)
+    for number, name in rows(connection, "SELECT number, name FROM map WHERE name GLOB ?", (f"{row.name}.*",)):
+        _end(connection, GoneMap(number=number, name=name, deleted_s=time.time(), by=by), ended)
+    return _end(connection, GoneMap(number=row.number, name=row.name, deleted_s=time.time(), by=by), ended)
+
+
+def _end(connection: apsw.Connection, gone: GoneMap, ended: EndedTokens) -> GoneMap:
     values = (gone.number, gone.name, gone.deleted_s, gone.by)
     connection.execute("INSERT INTO gone_map (number, name, deleted_s, by) VALUES (?, ?, ?, ?)", values)
-    connection.execute("INSERT INTO gone_token (hash, map) SELECT hash, map FROM token WHERE map = ?", (row.number,))
-    ended.note_map(connection, row.number)
-    connection.execute("DELETE FROM token WHERE map = ?", (row.number,))
+    connection.execute("INSERT INTO gone_token (hash, map) SELECT hash, map FROM token WHERE map = ?", (gone.number,))
+    ended.note_map(connection, gone.number)
+    connection.execute("DELETE FROM token WHERE map = ?", (gone.number,))
     # No name of a map has a slash.
-    connection.execute("UPDATE map SET name = '/' || number WHERE number = ?", (row.number,))
+    connection.execute("UPDATE map SET name = '/' || number WHERE number = ?", (gone.number,))
     return gone
 
 

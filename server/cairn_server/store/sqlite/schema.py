@@ -366,6 +366,10 @@ CREATE INDEX mark_changed ON mark (map, changed_seq, low_x, low_y, low_z, high_x
 ALTER TABLE author ADD COLUMN marks INTEGER NOT NULL DEFAULT 0;     -- of its commits, that are not taken out
 """
 
+LAYERS = """
+-- Earlier programs take a commit of version 4 for a damaged one, and the name of a layer for none of a map.
+"""
+
 ATTACHMENTS = """
 ALTER TABLE mark ADD COLUMN attached_sha BLOB;      -- SHA-256 of its attachment; NULL: it has none, or was taken out
 ALTER TABLE mark ADD COLUMN attached_bytes INTEGER; -- size that it states
@@ -411,6 +415,7 @@ STEPS = (
     ADDRESSES,
     GONE,
     MARKS,
+    LAYERS,
     ATTACHMENTS,
 )
 

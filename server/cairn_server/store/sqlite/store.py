@@ -15,8 +15,8 @@ from typing import TypeVar
 
 import apsw
 
-from cairn_map.commits.cursor import Cursor, first_chain
-from cairn_map.commits.ids import Author, Incarnation, RobotName, new_incarnation
+from cairn_map.commits.cursor import Cursor
+from cairn_map.commits.ids import Author, Incarnation, RobotName
 from cairn_map.epochs.epoch import BASE, Epoch
 from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import BadInputError, NotFoundError, UnreachableError
@@ -30,7 +30,7 @@ from cairn_server.store.branch_signs import LastSeen
 from cairn_server.store.folder_lock import lock_folder
 from cairn_server.store.private_files import close_to_others, make_private
 from cairn_server.store.sqlite.branches import SqliteBranchNotes, stored_branches
-from cairn_server.store.sqlite.changes import append_commit, heal_cell, next_number, write_fold
+from cairn_server.store.sqlite.changes import append_commit, heal_cell, insert_map, next_number, write_fold
 from cairn_server.store.sqlite.ended_tokens import LIST_NAME, EndedTokens
 from cairn_server.store.sqlite.failures import FULL, disk_full, opening_failure
 from cairn_server.store.sqlite.old_sums import measure_old_sums
@@ -43,7 +43,6 @@ from cairn_server.store.sqlite.retention import (
     delete_map,
     forget_evidence,
     missing_map,
-    next_map_number,
 )
 from cairn_server.store.sqlite.robot_keys import SqliteAdmittedKeys, admit_registration
 from cairn_server.store.sqlite.schema import MAPS, WAITING, WAITING_MAPS, ensure_schema
@@ -208,23 +207,7 @@ class SqliteStore(SqliteReads):
                 known = MapLayer(geometry=Geometry.model_validate_json(found[0]), epoch_s=found[1])
                 check_same_map(name, (known, SensorModel.model_validate_json(found[2])), (layer, sensor_model))
                 return False
-            number, log_id = next_map_number(connection), secrets.token_bytes(16)
-            tops = [0] * (2 + geometry.plane_count)
-            connection.execute(
-                "INSERT INTO map (number, name, geometry, sensor_model, operator, log_id, seq, chain, tops, epoch_s,"
-                " seal_key) VALUES (?, ?, ?, ?, ?, ?, 0, ?, ?, ?, randomblob(32))",
-                (
-                    number,
-                    name,
-                    geometry.model_dump_json(),
-                    sensor_model.model_dump_json(),
-                    new_incarnation(),
-                    log_id,
-                    first_chain(log_id, layer.digest()),
-                    json.dumps(tops),
-                    layer.epoch_s,
-                ),
-            )
+            insert_map(connection, name, layer, sensor_model, secrets.token_bytes(32))
             return True
 
         is_new = self._writer.run(job)

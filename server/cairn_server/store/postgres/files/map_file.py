@@ -25,13 +25,14 @@ from cairn_map.errors import ConflictError, NotFoundError
 from cairn_map.evidence.grid import Geometry
 from cairn_server.store.objects.cold_bytes import ColdReads, split_cell_object
 from cairn_server.store.postgres.connections import Connection, Connections, first, rows
+from cairn_server.store.postgres.pushes import NUMBER_BITS
 from cairn_server.store.postgres.schema import (
     ATTACHMENTS_OLDEST,
     EPOCHS_OLDEST,
+    LAYERS_OLDEST,
     MARKS_OLDEST,
     bar_older_programs,
 )
-from cairn_server.store.postgres.store import NUMBER_BITS
 from cairn_server.store.shares import limits_of
 from cairn_server.store.stored_columns import TableRows
 
@@ -62,6 +63,10 @@ MAP = (
     "SELECT map, name, geometry, sensor_model, seal_key, epoch_s, log_id, seq, chain, folded, cells, cells_bytes,"
     " fingerprint, history_bytes, corners FROM map JOIN head USING (map) WHERE name = %s"
 )
+DEFINES = (
+    "SELECT EXISTS (SELECT FROM commits WHERE map = %s AND cells = 0 AND position('\"layer\":'::bytea IN meta) > 0)"
+)
+"""SQL that finds a commit which defines a layer; in texts of a meta a quote has a backslash before it."""
 HAS_MARKS = "SELECT EXISTS (SELECT FROM mark WHERE map = %s)"
 HAS_ATTACHED = "SELECT EXISTS (SELECT FROM mark WHERE map = %s AND attached_sha IS NOT NULL)"
 HEAD = ("log_id", "seq", "chain", "folded", "cells", "cells_bytes", "fingerprint", "history_bytes")
@@ -186,6 +191,9 @@ class _Putting:
             self._bar_older("marks", MARKS_OLDEST)
             if first(self._connection, HAS_ATTACHED, (self.number,)):
                 self._bar_older("attachments of marks", ATTACHMENTS_OLDEST)
+        has_layers = "." in self.name or (table.name == "commits" and first(self._connection, DEFINES, (self.number,)))
+        if has_layers:
+            self._bar_older("layers", LAYERS_OLDEST)
 
     def _map(self, values: Mapping[str, Any]) -> None:
         self.name = values["name"]
