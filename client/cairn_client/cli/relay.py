@@ -24,7 +24,7 @@ from cairn_client.cli.arguments import add_token, parser, say
 from cairn_client.http.backoff import Backoff
 from cairn_client.http.map_url import split_map_url
 from cairn_client.http.origin_tokens import OriginTokens
-from cairn_client.relay.carried_attachments import hand_over_attachments
+from cairn_client.relay.carried_attachments import give_all_attachments
 from cairn_client.relay.carried_commits import CarriedCommits
 from cairn_client.relay.link import RelayApi, ServerEnd, hold_between
 from cairn_client.relay.round import AT_ONCE, REST_S, RelayReport, RelaySide, Undelivered, log_report, relay_round
@@ -89,8 +89,8 @@ def _once(here: AttachmentEnd, there: AttachmentEnd, resting: Undelivered, *, ma
                 raise error
             time.sleep(backoff.next_s(error.retry_after_s))
             total.has_more = True
-    while hand_over_attachments(here, there):
-        pass
+    give_all_attachments(here, there)
+    give_all_attachments(there, here)
     say(f"map {map_name}: {total.moved[RelaySide.THERE]} commits to {where}, {total.moved[RelaySide.HERE]} from there")
     return total
 

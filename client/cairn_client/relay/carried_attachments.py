@@ -5,6 +5,7 @@ attachments wants them again, and bytes that lie are found by their SHA-256, whe
 """
 
 import logging
+from collections.abc import Collection
 
 from cairn_map.commits.attachment import Attachment
 from cairn_map.errors import CairnError, UnreachableError
@@ -17,38 +18,56 @@ AT_ONCE = 64
 
 
 def hand_over_attachments(here: AttachmentEnd, there: AttachmentEnd) -> int:
-    """Hand over what either place wants and the other has; their count. What one place refuses, the other keeps.
+    """Hand over what either place wants and the other has, some at a time; their count.
 
     Raises:
         UnreachableError: the link broke; what was handed over stays so.
     """
-    return give_attachments(here, there) + give_attachments(there, here)
+    return len(give_attachments(here, there)) + len(give_attachments(there, here))
 
 
-def give_attachments(source: AttachmentEnd, target: AttachmentEnd) -> int:
-    """Hand over what one place wants and the other has; as `hand_over_attachments`."""
+def give_all_attachments(source: AttachmentEnd, target: AttachmentEnd) -> None:
+    """Hand over all that one place wants and the other has, each once, though it may be wanted again at once.
+
+    Raises:
+        UnreachableError: as `hand_over_attachments`.
+    """
+    handed: set[str] = set()
+    while moved := give_attachments(source, target, but_not=handed):
+        handed |= moved
+
+
+def give_attachments(
+    source: AttachmentEnd, target: AttachmentEnd, *, but_not: Collection[str] = frozenset()
+) -> set[str]:
+    """Hand over some of what one place wants and the other has; their SHA-256. What is refused, the source keeps.
+
+    Raises:
+        UnreachableError: as `hand_over_attachments`.
+    """
     if not source.has_attachments():  # then no place is asked: a map without attachments costs no request
-        return 0
+        return set()
     try:
         wanted = target.wanted_attachments()
     except UnreachableError:
         raise
     except CairnError as exc:  # such as a server that knows no attachments
         log.info("no attachments go there: %s", exc.message)
-        return 0
-    count = 0
+        return set()
+    moved: set[str] = set()
     for attachment in wanted:
-        if count == AT_ONCE:
+        if len(moved) == AT_ONCE:
             break
         try:
-            count += _move(attachment, source, target)
+            if attachment.sha256 not in but_not and _move(attachment, source, target):
+                moved.add(attachment.sha256)
         except UnreachableError as exc:
             if exc.kind == "no_link":
                 raise
             log.warning("attachment %s waits: %s", attachment.sha256, exc.message)
         except CairnError as exc:
             log.error("attachment %s is not handed over: %s", attachment.sha256, exc.message)
-    return count
+    return moved
 
 
 def _move(attachment: Attachment, source: AttachmentEnd, target: AttachmentEnd) -> bool:

@@ -150,7 +150,7 @@ class Upstream:
         if report.is_all_there:
             self._server.handed_over(info.name, begun_s)
         if not report.cut:
-            report.has_more |= hand_over_attachments(here, there) > 0
+            hand_over_attachments(here, there)
         return report
 
     def _say_refused(self, refused: list[tuple[str, CairnError]]) -> None:

@@ -11,7 +11,7 @@ from tests.fixtures.map.marks import attached, mark_commit
 from tests.fixtures.server.live import until
 
 from cairn_client.http.attachment_copy import fetched_attachment
-from cairn_client.relay.carried_attachments import hand_over_attachments
+from cairn_client.relay.carried_attachments import give_all_attachments, hand_over_attachments
 from cairn_client.relay.carried_commits import ATTACHMENTS_SHARE, CarriedCommits
 from cairn_client.replica.attachment_folder import AttachmentFolder
 from cairn_map.commits.attachment import Attachment, attachment_of
@@ -114,6 +114,23 @@ def test_bytes_of_another_size_go_nowhere(tmp_path: Path) -> None:
     carried.push(carried_mark(0, b"true"))
     assert hand_over_attachments(Liar(), carried) == 0  # type: ignore[arg-type]
     assert not carried.has_attachments()
+
+
+class Insatiable(Liar):
+    """A place that takes what it is given, and wants it again."""
+
+    def wanted_attachments(self) -> list[Attachment]:
+        return [attachment_of(b"true")]
+
+    def keep_attachment(self, attachment: Attachment, data: bytes) -> None:
+        """Forget it."""
+
+
+def test_a_place_that_wants_the_same_again_and_again_is_given_it_once(tmp_path: Path) -> None:
+    carried = CarriedCommits(tmp_path / "carried", MAP, size_bytes_max=10**6)
+    carried.keep_attachment(attachment_of(b"true"), b"true")
+    give_all_attachments(carried, Insatiable())  # type: ignore[arg-type]
+    assert hand_over_attachments(carried, Insatiable()) == 1  # type: ignore[arg-type]
 
 
 def test_files_of_others_in_the_folder_are_no_attachments(tmp_path: Path) -> None:

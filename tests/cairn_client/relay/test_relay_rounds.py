@@ -46,6 +46,9 @@ class Place:
             raise self.breaks_at[commit.id]
         self.has.add(commit.id)
 
+    def has_attachments(self) -> bool:
+        return False
+
 
 class Clock:
     """Time as a test wants it."""

@@ -329,7 +329,7 @@ def test_each_token_opens_the_websockets_that_the_document_lets_it_read(holders:
 
 
 def test_the_matrix_has_routes_of_each_kind_of_right() -> None:
-    assert {"anybody", "admin", "operator", "reader", "own robot", "relay", "enroller"} == {
+    assert {"anybody", "admin", "operator", "reader", "robot", "own robot", "relay", "enroller"} == {
         role for roles in ROLES_OF.values() for role in roles
     }
 

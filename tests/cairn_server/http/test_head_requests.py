@@ -31,7 +31,7 @@ def kept(answer: httpx.Response) -> dict[str, str]:
 @pytest.mark.parametrize("path", GETS)
 def test_every_route_that_answers_get_answers_head(live: Live, row: MapRow, path: str) -> None:
     place = {"name": row.name, "branch": "mole", "commit": str(pushed(0, 0).id), "cell": str(cell_of_key(KEYS[0]))}
-    place |= {"voxel": "0,0,0", "file": "none.js", "token": "none"}
+    place |= {"voxel": "0,0,0", "file": "none.js", "token": "none", "sha": "0" * 64}
     url = path.format(**place)
     get, head = live.ask("GET", url), live.http.head(url)
     assert get.status_code == head.status_code != 405

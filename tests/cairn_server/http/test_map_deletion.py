@@ -51,7 +51,7 @@ def test_every_route_tells_the_map_s_own_tokens_that_it_is_gone(guarded: Live, h
     if has_namesake:
         guarded.service.maps.create(row.name, CreateMap(geometry=SMALL))
     names = {"name": row.name, "branch": "mole", "robot": "mole", "author": str(MOLE), "commit": str(pushed(0, 0).id)}
-    names |= {"cell": "0,0,0", "voxel": "0,0,0"}
+    names |= {"cell": "0,0,0", "voxel": "0,0,0", "sha": "0" * 64}
     for method, path in ROLES_OF:
         if "{name}" not in path or (method, path) == ("PUT", "/maps/{name}"):
             continue

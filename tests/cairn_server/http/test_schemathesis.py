@@ -42,6 +42,7 @@ PLACES = {
     "voxel": ["0,0,0", "-1,0,2"],
     "token": ["looker"],
     "author": [f"mole.{'5' * 16}"],
+    "sha": ["0" * 64],
     "file": ["x.js"],
 }
 """Names of things that exist, so that not every answer is 404."""

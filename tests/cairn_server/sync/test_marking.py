@@ -95,6 +95,25 @@ def test_a_robot_pushes_marks_to_maps_of_either_kind(live: Live, epoch_s: int | 
     assert names(page(live, row)) == ["north door"]
 
 
+def test_marks_outlive_evidence_that_is_not_kept_and_can_be_changed_and_handed_over_after(live: Live) -> None:
+    row = live.new_map()
+    evidence, made = pushed(0, 0, MOLE), mark_commit(1, mark(), mark("door"), author=MOLE)
+    for commit in (evidence, made, mark_commit(0, mark("gone"), author=WREN)):
+        live.push(row, commit).raise_for_status()
+        live.folded(row)
+    live.retract(row, mark_commit(0, mark("gone"), author=WREN)).raise_for_status()
+    live.folded(row)
+    # Of four commits one has evidence: marks, and what took one out, are none.
+    assert live.service.store.forget_evidence(row, before_s=float("inf"), limit=99) == 1
+    assert kind_of(live.http.get(f"/maps/{row.name}/commits/{evidence.id}")) == "evidence_gone"
+    assert live.http.get(f"/maps/{row.name}/commits/{made.id}").content == made.data
+    assert names(page(live, row)) == ["lamp", "door"]
+    put(live, row, {"of": f"{made.id}:1", "mark": DOOR})
+    live.folded(row)
+    assert names(page(live, row)) == ["lamp", "north door"]
+    assert live.push(row, made).json()["state"] == "known"
+
+
 def test_two_edits_of_one_mark_that_were_made_apart_are_both_shown(live: Live) -> None:
     row = live.new_map()
     for commit in (

@@ -17,7 +17,7 @@ from cairn_client.cli.maps.map_sides import Difference, MapSide, difference, sid
 from cairn_client.http.backoff import Backoff
 from cairn_client.http.map_url import split_map_url
 from cairn_client.http.origin_tokens import OriginTokens
-from cairn_client.relay.carried_attachments import give_attachments
+from cairn_client.relay.carried_attachments import give_all_attachments
 from cairn_client.relay.link import RelayApi, ServerEnd, hold_between
 from cairn_client.relay.round import RelayReport, RelaySide, Undelivered, copy_round, log_report
 from cairn_map.commits.ids import CommitId
@@ -204,8 +204,7 @@ class _Copy:
                 total.has_more = True
             elif moved:
                 self._backoff.reset()
-        while give_attachments(self.source.end, self.target.end):
-            pass
+        give_all_attachments(self.source.end, self.target.end)
         return total
 
     def _compared(self) -> tuple[Difference, tuple[MapSide, MapSide]]:
