@@ -115,7 +115,8 @@ ROOMS = {
     "cairn_sim": "scene render robots evaluation experiment study demo sim_command warm_up",
     "cairn_server": """
         memory_shares cell_room settings processes map_refusals
-        store store.objects store.sqlite store.sqlite.files store.postgres store.postgres.files store.settling
+        store.attachments store store.objects store.sqlite store.sqlite.files store.postgres store.postgres.files
+        store.settling
         metrics access live upkeep folding sync.checks sync views maps service
         http.middleware http.routes http operations
     """,

@@ -12,8 +12,9 @@ TYPE_CHECKING = False  # type checkers take it for true; importing `typing` woul
 
 if TYPE_CHECKING:
     from cairn_calib.rig.rig import Rig, load_rig
-    from cairn_client.folders.map_folder import open_map
+    from cairn_client.folders.map_folder import open_layers, open_map
     from cairn_client.replica.limits import Limits
+    from cairn_client.robot.layered_robot import LayeredRobot
     from cairn_client.robot.robot import Robot
     from cairn_client.robot.robot_events import (
         CellsChanged,
@@ -43,7 +44,9 @@ if TYPE_CHECKING:
     )
     from cairn_map.evidence.grid import Geometry, geometry_for
     from cairn_map.evidence.inverse_sensor_model import SensorModel
+    from cairn_map.queries.layered_snapshot import LayeredSnapshot
     from cairn_map.queries.map_snapshot import MapSnapshot
+    from cairn_map.queries.mark_groups import MarkGroup, group_marks
     from cairn_map.queries.occupancy_states import State
 
     __version__: str
@@ -59,10 +62,13 @@ __all__ = [
     "DeniedError",
     "Event",
     "Geometry",
+    "LayeredRobot",
+    "LayeredSnapshot",
     "Limits",
     "LinkBack",
     "LinkLost",
     "MapSnapshot",
+    "MarkGroup",
     "NotFoundError",
     "OutboxNearlyFull",
     "Profile",
@@ -78,16 +84,19 @@ __all__ = [
     "SyncFailed",
     "UnreachableError",
     "geometry_for",
+    "group_marks",
     "kelvin_from_celsius",
     "load_rig",
+    "open_layers",
     "open_map",
     "open_recording",
 ]
 
 _MODULES = {
     "cairn_calib.rig.rig": "Rig load_rig",
-    "cairn_client.folders.map_folder": "open_map",
+    "cairn_client.folders.map_folder": "open_layers open_map",
     "cairn_client.replica.limits": "Limits",
+    "cairn_client.robot.layered_robot": "LayeredRobot",
     "cairn_client.robot.robot": "Robot",
     "cairn_client.robot.robot_events": """
         Event Committed Pushed Refused CellsChanged CellsDropped OutboxNearlyFull LinkLost LinkBack SyncFailed
@@ -102,7 +111,9 @@ _MODULES = {
     """,
     "cairn_map.evidence.grid": "Geometry geometry_for",
     "cairn_map.evidence.inverse_sensor_model": "SensorModel",
+    "cairn_map.queries.layered_snapshot": "LayeredSnapshot",
     "cairn_map.queries.map_snapshot": "MapSnapshot",
+    "cairn_map.queries.mark_groups": "MarkGroup group_marks",
     "cairn_map.queries.occupancy_states": "State",
 }
 """Names by the module that defines them; the same as the imports above, which only type checkers read."""

@@ -3,8 +3,9 @@
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
-from cairn_map.epochs.layer import MapLayer
-from cairn_map.errors import ConflictError, NotFoundError
+from cairn_map.commits.ids import map_of_layer
+from cairn_map.epochs.layer import EVIDENCE, LAYERS_MAX, LayerDefinition, MapLayer
+from cairn_map.errors import BadInputError, ConflictError, NotFoundError
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 
 
@@ -57,6 +58,39 @@ def check_same_map(name: str, known: tuple[MapLayer, SensorModel], asked: tuple[
         raise ConflictError(
             "map_exists", f"map {name} exists with {sensor_model!r}; asked for was {other_model!r}. {way_out}"
         )
+
+
+def check_same_layer(name: str, known: MapLayer, asked: LayerDefinition) -> None:
+    """Refuse to define a layer of a name that another one of the map has.
+
+    Raises:
+        ConflictError: kind `other_layer`.
+    """
+    if known != MapLayer(geometry=asked.geometry, epoch_s=asked.epoch_s):
+        raise ConflictError(
+            "other_layer",
+            f"layer {name} is there with {known}; asked for was {asked}. A layer's definition never changes: use it as "
+            "it is, or take another name",
+        )
+
+
+def check_layer_count(name: str, further: int) -> None:
+    """Refuse one more layer of a map that has as many as one may have.
+
+    Raises:
+        ConflictError: kind `too_many_layers`.
+    """
+    if further + 1 >= LAYERS_MAX:
+        raise ConflictError(
+            "too_many_layers",
+            f"map {name} has {further} layers besides {EVIDENCE}, and a map at most {LAYERS_MAX} in all; make another "
+            "map for more",
+        )
+
+
+def layer_of_map(row_name: str, what: str) -> BadInputError:
+    """Error for what is done on a map as a whole, and was asked of one of its layers."""
+    return BadInputError("layer_of_map", f"{row_name} is a layer of map {map_of_layer(row_name)}: {what}")
 
 
 def _epochs_text(layer: MapLayer) -> str:

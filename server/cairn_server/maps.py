@@ -13,7 +13,7 @@ from collections.abc import Callable
 from itertools import accumulate
 
 from cairn_map.commits.cursor import Cursor
-from cairn_map.commits.ids import robot_name
+from cairn_map.commits.ids import map_of_layer, robot_name
 from cairn_map.errors import BadInputError
 from cairn_map.wire.live_events import RobotSign
 from cairn_map.wire.messages import BranchInfo, CreateMap, MapDeleted, MapInfo, MapSizes, Register, Registered
@@ -22,6 +22,7 @@ from cairn_server.cell_room import check_geometry
 from cairn_server.live.hub import Hub
 from cairn_server.live.live_map import LiveRobots
 from cairn_server.live.robot_reports import RobotReports
+from cairn_server.map_refusals import layer_of_map
 from cairn_server.memory_shares import MemoryShares
 from cairn_server.store.admission import OWN_WORD, Grounds
 from cairn_server.store.store import Store
@@ -56,22 +57,30 @@ class Maps:
         """Create a map unless an equal one exists; its facts, and whether it is new.
 
         Raises:
+            BadInputError: kind `bad_name`; a layer is added to its map.
             BadInputError: kind `cell_too_large`: one full cell would take more memory than this server has for it.
             ConflictError: kind `map_exists`: another geometry, sensor model or length of epochs; `older_servers`.
         """
+        if map_of_layer(name) is not None:
+            raise BadInputError("bad_name", f"{name[:80]} would be a layer: add it to its map (cairn map layer add)")
         if all(row.name != name for row in self._store.maps()):
             check_geometry(request.geometry, self._shares)
         row, is_new = self._store.create_map(robot_name(name), request.geometry, request.sensor_model, request.epoch_s)
         return self.info(row), is_new
 
     def delete(self, row: MapRow, *, by: str) -> MapDeleted:
-        """Delete a map for good: its tokens end, its listeners are sent away, its rows go in the background.
+        """Delete a map and its layers for good: tokens end, listeners are sent away, rows go in the background.
 
         Raises:
+            BadInputError: kind `layer_of_map`: a layer stays for as long as its map.
             NotFoundError: kind `gone`: it was deleted already.
         """
+        if row.of_map is not None:
+            raise layer_of_map(row.name, "it goes with the map; to leave it alone costs nothing")
+        layers = self._store.layers(row)
         gone = self._store.delete_map(row, by=by)
-        self._hub.map_gone(row)
+        for each in (row, *layers):
+            self._hub.map_gone(each)
         self._on_delete()
         return MapDeleted(name=gone.name, deleted_s=gone.deleted_s)
 
@@ -145,6 +154,16 @@ class Maps:
         self._store.deregister(row, branch)
         self._reports.forget(row, branch)
         self._hub.robot_left(row, branch)
+
+    def expel(self, row: MapRow, branch: str) -> None:
+        """Remove a robot and its tokens from a map and all its layers; its evidence stays.
+
+        Raises:
+            NotFoundError: kind `no_branch`: it is on none of them.
+        """
+        found = [each for each in (row, *self._store.layers(row)) if self._store.branch(each, branch) is not None]
+        for each in found or [row]:
+            self.deregister(each, branch)
 
     def branches(self, row: MapRow) -> list[BranchInfo]:
         """All robots of a map by name, and how far each is behind the head."""

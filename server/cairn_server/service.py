@@ -55,9 +55,11 @@ from cairn_server.store.row_spool import remove_spools
 from cairn_server.store.store import Store
 from cairn_server.store.store_rows import MapRow, UsedPart
 from cairn_server.sync.admissions import Admissions
+from cairn_server.sync.attachment_transfer import AttachmentTransfer
 from cairn_server.sync.clock_trust import ClockTrust
 from cairn_server.sync.handing_over import UpstreamProgress
 from cairn_server.sync.held_commits import HeldCommits, WantedCommits
+from cairn_server.sync.map_layers import MapLayers
 from cairn_server.sync.marking import Marking
 from cairn_server.sync.operator_commits import OperatorCommits
 from cairn_server.sync.pushes import Pushes
@@ -87,6 +89,8 @@ class SyncParts:
     uploads: Uploads
     retracts: Retracts
     marking: Marking
+    layers: MapLayers
+    attachments: AttachmentTransfer
     replies: MainReplies
     held: HeldCommits
     upstream: UpstreamProgress
@@ -188,6 +192,8 @@ class Service:
             Uploads(store, pushes),
             Retracts(store, commits, wanted, on_new=on_new),
             Marking(store, commits, on_new=on_new),
+            MapLayers(store, commits, settings.memory, info=self.maps.info, on_new=on_new),
+            AttachmentTransfer(store.attachments),
             MainReplies(
                 store,
                 self.cells,

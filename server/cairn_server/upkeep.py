@@ -2,6 +2,7 @@
 
     forget    evidence that is older than it must be kept; some commits a step
     clear     rows of deleted maps; some megabytes a step
+    sweep     attachments of marks that none names any more; some a step
     shrink    room in the store's file that nothing uses any more, given back to the disk
 
 A duty with more to do rests after each step for a multiple of its length: most of the time is for pushes and folds.
@@ -52,7 +53,7 @@ class Upkeep:
         self._keep_evidence_s = keep_evidence_s
         self._may_forget_s = may_forget_s
         self._steady_s = steady_s
-        self._next_s = dict.fromkeys((self._forget, self._clear, self._shrink), float("-inf"))
+        self._next_s = dict.fromkeys((self._forget, self._clear, self._sweep, self._shrink), float("-inf"))
         """Steady time at which each duty is due."""
         self._hurried = threading.Event()
 
@@ -103,6 +104,10 @@ class Upkeep:
             self._next_s[self._shrink] = float("-inf")
             return None
         return LOOK_EVERY_S
+
+    def _sweep(self) -> float | None:
+        """Remove some attachments that are out of use; as `_forget`."""
+        return None if self._store.attachments.sweep(now_s=self._store.age.now_s()) else LOOK_EVERY_S
 
     def _shrink(self) -> float | None:
         """Give some room back to the disk; as `_forget`."""

@@ -7,6 +7,7 @@ import pytest
 from tests.fixtures.server.live import Live
 from tests.fixtures.server.protocol_document import DOCUMENT, ROOT, ROUTE, documented_kinds, routes_of
 
+from cairn_map.commits.attachment import ATTACHMENT_BYTES_MAX
 from cairn_map.commits.commit import COMMIT_BYTES_MAX, RETRACTS_MAX
 from cairn_map.commits.mark import MARKS_MAX
 from cairn_map.files import octomap
@@ -22,6 +23,7 @@ from cairn_server.live import robot_reports
 from cairn_server.memory_shares import CHECK_MAX_BYTES
 from cairn_server.settings import Quotas, Settings
 from cairn_server.store import numbering, shares, store_rows
+from cairn_server.store.attachments import attachments
 from cairn_server.sync import cell_changes, missing, uploads
 from cairn_server.sync.checks import check_pool, commit_checks
 from cairn_server.views import (
@@ -118,6 +120,8 @@ def test_the_statuses_in_the_document_are_those_of_the_code(kind: str) -> None:
         ("marks in one live event", live_events.MARKS_MAX),
         ("marks of one commit", MARKS_MAX),
         ("marks of one robot on a map that are not taken out", shares.MARKS_OF_ROBOT_MAX),
+        ("one attachment of a mark", ATTACHMENT_BYTES_MAX),
+        ("attachments of one robot's marks on a map", attachments.OF_ROBOT_BYTES_MAX),
         ("values in one JSON text", JSON_VALUES_MAX),
         ("problem's `detail`", problems.DETAIL_CHARACTERS_MAX),
         ("until a request's head is whole", Settings().head_s),

@@ -1,10 +1,10 @@
-"""Stored bytes of format versions 1 to 3: made once, kept for ever.
+"""Stored bytes of format versions 1 to 4: made once, kept for ever.
 
     python -m tests.formats.make_formats
 
 writes the files that are missing, never over one that is there: if the code writes other bytes today, the old ones
-must still decode. What they decode to is in `v1.json`, `v2.json` and `v3.json`. `before-epochs.*.zst` are a store, a
-backup and a robot's folder of the last version without epochs.
+must still decode. What they decode to is in `v1.json` to `v4.json`. `before-epochs.*.zst` are a store, a backup
+and a robot's folder of the last version without epochs.
 """
 
 import json
@@ -15,13 +15,14 @@ from tests.naive.evidence import interleave
 
 from cairn_map.codec.cell_code import Profile, decode_cell, encode_cell
 from cairn_map.codec.history_code import decode_history, encode_history
+from cairn_map.commits.attachment import attachment_of
 from cairn_map.commits.commit import CommitMeta, ScanPose, make_commit
 from cairn_map.commits.commit_reading import open_commit
 from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.mark import make_mark
 from cairn_map.epochs.cell_history import CellHistory, cell_history, history_fingerprint
 from cairn_map.epochs.epoch import BASE, Epoch
-from cairn_map.epochs.layer import MapLayer
+from cairn_map.epochs.layer import LayerDefinition, MapLayer
 from cairn_map.evidence.channels import COLOUR, INTENSITY, TEMPERATURE, Channel, ChannelKind
 from cairn_map.evidence.evidence import Evidence, empty_evidence, packed_evidence
 from cairn_map.evidence.fingerprint import fingerprint
@@ -35,6 +36,7 @@ EPOCH_CELLS = ("v2-fast.cell", "v2-small.cell")
 
 FOLDER = Path(__file__).parent
 DOSE = Channel(kind=ChannelKind.SCALAR, name="dose", unit="µSv/h", step=0.01, zero=-1.5)
+SCALARS = tuple(Channel(kind=ChannelKind.SCALAR, name=name, unit="u", step=1.0) for name in ("a", "b"))
 GEOMETRY = Geometry(voxel_edge_um=40_000, depth=4, channels=(COLOUR, INTENSITY, TEMPERATURE, DOSE))
 LAYER = MapLayer(geometry=GEOMETRY, epoch_s=120)
 KEY = cell_key((-3, 2, 0))
@@ -116,6 +118,23 @@ def mark_commit_bytes() -> bytes:
     return make_commit(meta, {}, GEOMETRY).data
 
 
+def layer_commit_bytes() -> bytes:
+    """A commit that defines a layer, whose depth is not the one that a reader would take."""
+    fine = Geometry(voxel_edge_um=10_000, depth=7, channels=(*GEOMETRY.channels, *SCALARS))
+    layer = LayerDefinition(name="fine_1", geometry=fine, epoch_s=60)
+    meta = CommitMeta(id=f"{AUTHOR}.10", geometry=GEOMETRY.digest().hex(), layer=layer, note="n")
+    return make_commit(meta, {}, GEOMETRY).data
+
+
+def attachment_commit_bytes() -> bytes:
+    """A commit with a mark that names an attachment."""
+    lamp = make_mark(
+        kind="hot_spot", name="lamp", at_m=(1.25, -2.0, 0.4), time_s=1.5e9, attachment=attachment_of(b"a picture")
+    )
+    meta = CommitMeta(id=f"{AUTHOR}.10", geometry=GEOMETRY.digest().hex(), marks=(lamp,))
+    return make_commit(meta, {}, GEOMETRY).data
+
+
 def cursor(seq: int) -> Cursor:
     """A made-up place in a made-up log."""
     return Cursor(bytes(range(16)), seq, bytes(range(16, 32)))
@@ -154,6 +173,8 @@ def made() -> dict[str, bytes]:
         "v2-small.cell": encode_history(KEY, history(), LAYER, profile=Profile.SMALL).data,
         "v2.commit": epoch_commit_bytes(),
         "v3.commit": mark_commit_bytes(),
+        "v4.commit": layer_commit_bytes(),
+        "v3-attachment.commit": attachment_commit_bytes(),
     }
 
 
@@ -163,7 +184,9 @@ def found() -> dict[str, object]:
     commit, _ = open_commit((FOLDER / "v1.commit").read_bytes())
     frames = frames_of((FOLDER / "v1.reply").read_bytes())
     payloads = [frame for frame in frames if isinstance(frame, CellFrame) and frame.payload]
-    meta = json.loads(commit.meta.model_dump_json(exclude={"layers", "epoch", "marks"}))  # fields of later versions
+    meta = json.loads(
+        commit.meta.model_dump_json(exclude={"layers", "epoch", "marks", "layer"})
+    )  # fields of later versions
     return {
         "geometry": GEOMETRY.digest().hex(),
         "digests": {name: cell.digest.hex() for name, cell in cells.items()},
@@ -186,13 +209,29 @@ def found_with_epochs() -> dict[str, object]:
             name: history_fingerprint(cell.history, cell.key, layer_word=LAYER.word).hex()
             for name, cell in cells.items()
         },
-        "commit": {"sha": commit.sha.hex(), "meta": json.loads(commit.meta.model_dump_json(exclude={"marks"}))},
+        "commit": {
+            "sha": commit.sha.hex(),
+            "meta": json.loads(commit.meta.model_dump_json(exclude={"marks", "layer"})),
+        },
     }
 
 
 def found_with_marks() -> dict[str, object]:
     """Content of the stored bytes of version 3, as it is read today."""
     commit, _ = open_commit((FOLDER / "v3.commit").read_bytes())
+    meta = commit.meta.model_dump_json(exclude={"layer": True, "marks": {"__all__": {"attachment"}}})  # later fields
+    return {"commit": {"sha": commit.sha.hex(), "meta": json.loads(meta)}}
+
+
+def found_with_attachments() -> dict[str, object]:
+    """Content of the stored bytes of version 3 with an attachment, as it is read today."""
+    commit, _ = open_commit((FOLDER / "v3-attachment.commit").read_bytes())
+    return {"commit": {"sha": commit.sha.hex(), "meta": json.loads(commit.meta.model_dump_json(exclude={"layer"}))}}
+
+
+def found_with_layer() -> dict[str, object]:
+    """Content of the stored bytes of version 4, as it is read today."""
+    commit, _ = open_commit((FOLDER / "v4.commit").read_bytes())
     return {"commit": {"sha": commit.sha.hex(), "meta": json.loads(commit.meta.model_dump_json())}}
 
 
@@ -207,6 +246,12 @@ def main() -> None:
         (FOLDER / "v2.json").write_text(json.dumps(found_with_epochs(), indent=1, sort_keys=True) + "\n")
     if not (FOLDER / "v3.json").exists():
         (FOLDER / "v3.json").write_text(json.dumps(found_with_marks(), indent=1, sort_keys=True) + "\n")
+    if not (FOLDER / "v4.json").exists():
+        (FOLDER / "v4.json").write_text(json.dumps(found_with_layer(), indent=1, sort_keys=True) + "\n")
+    if not (FOLDER / "v3-attachment.json").exists():
+        (FOLDER / "v3-attachment.json").write_text(
+            json.dumps(found_with_attachments(), indent=1, sort_keys=True) + "\n"
+        )
 
 
 if __name__ == "__main__":

@@ -12,7 +12,9 @@ from tests.formats.make_formats import (
     LAYER,
     evidence,
     found,
+    found_with_attachments,
     found_with_epochs,
+    found_with_layer,
     found_with_marks,
     history,
     wall,
@@ -70,3 +72,8 @@ def test_stored_cells_with_epochs_hold_their_rows_for_both_decoders(name: str) -
 
 def test_stored_bytes_with_marks_still_mean_what_they_meant() -> None:
     assert found_with_marks() == json.loads((FOLDER / "v3.json").read_text())
+    assert found_with_attachments() == json.loads((FOLDER / "v3-attachment.json").read_text())
+
+
+def test_the_stored_definition_of_a_layer_still_means_what_it_meant() -> None:
+    assert found_with_layer() == json.loads((FOLDER / "v4.json").read_text())

@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
-from tests.memory_store.admission import admit_commit
+from tests.memory_store.admission import Keys, admit_commit
 
 from cairn_map.commits.cursor import ENTRY_FOLD, Cursor, first_chain
 from cairn_map.commits.ids import SERVERS_OWN, Author, CommitId
@@ -126,15 +126,18 @@ class MemoryMap:
         """Bytes of the commits whose evidence is kept."""
         return sum(kept.new.size_bytes for kept in self.commits.values() if not kept.is_gone)
 
-    def append(self, commit: NewCommit, *, age_s: float) -> bool:
-        """Keep a commit at an age of the store; False if the same one is known already."""
+    def append(self, commit: NewCommit, *, age_s: float, keys: Keys) -> bool:
+        """Keep a commit at an age of the store; False if the same one is known already.
+
+        The keys are those that robots' names are bound to, of a layer its map's.
+        """
         known = self.commits.get(commit.id)
         if known is not None:
             return self._append_again(known, commit, age_s)
         self._check_kept(commit.retracts)
         intervals = self._checked_intervals(commit.id, is_carried=commit.via is not None)
         self._check_sums(commit)
-        admit_commit(self.keys, commit.id.author, commit.grounds)
+        admit_commit(keys, commit.id.author, commit.grounds)
         top, _ = self.authors.get(commit.id.author, (0, 0))
         if commit.marks:
             check_marks(commit, self._held_marks(commit.id.author.robot, without=commit.retracts))
@@ -342,15 +345,18 @@ def _sum(tops: Tops, more: Tops | None) -> Tops:
     return tuple(a + b for a, b in zip(tops, more, strict=True)) if more else tops
 
 
-def new_memory_map(number: int, name: str, layer: MapLayer, sensor_model: SensorModel) -> MemoryMap:
-    """A map without anything in it."""
+def new_memory_map(
+    number: int, name: str, layer: MapLayer, sensor_model: SensorModel, of_map: MapRow | None = None
+) -> MemoryMap:
+    """A map, or a layer of one, without anything in it."""
     row = MapRow(
         number=number,
         name=name,
         geometry=layer.geometry,
         sensor_model=sensor_model,
-        seal_key=secrets.token_bytes(32),
+        seal_key=of_map.seal_key if of_map else secrets.token_bytes(32),
         epoch_s=layer.epoch_s,
+        of_map=of_map.number if of_map else None,
     )
     log_id = secrets.token_bytes(16)
     return MemoryMap(row, Cursor(log_id, 0, first_chain(log_id, layer.digest())))

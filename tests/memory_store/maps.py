@@ -10,8 +10,10 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from tests.memory_store.admission import Keys
 from tests.memory_store.map import MemoryMap
 
+from cairn_map.commits.ids import map_of_layer
 from cairn_map.errors import UnreachableError
 from cairn_server.map_refusals import GoneMap, map_gone, no_map
 from cairn_server.store.replica_notes import FoldHint, OnHint
@@ -60,6 +62,14 @@ class MemoryMaps:
                 state = maps[row.name] = state.copied()
             yield state
             self.written += 1
+
+    @contextmanager
+    def changing_keys(self, row: MapRow) -> Iterator[Keys]:
+        """Keys that robots' names are bound to on a map, of a layer its map's; no snapshot has them."""
+        with self.reading(row), self.locked() as maps:
+            name = map_of_layer(row.name)
+            with self.changing(row if name is None else maps[name].row) as state:
+                yield state.keys
 
     def row(self, name: str) -> MapRow:
         """The map of a name.

@@ -16,15 +16,15 @@ class MemoryAdmittedKeys:
 
     def all(self, row: MapRow) -> list[RobotKey]:
         """All admitted keys, by robot and incarnation."""
-        with self._maps.reading(row) as state:
-            return [state.keys[author] for author in sorted(state.keys)]
+        with self._maps.reading(row), self._maps.changing_keys(row) as keys:
+            return [keys[author] for author in sorted(keys)]
 
     def of(self, row: MapRow, robot: str) -> dict[Incarnation, RobotKey]:
         """Admitted keys of a robot."""
-        with self._maps.reading(row) as state:
-            return known(state.keys, robot)
+        with self._maps.reading(row), self._maps.changing_keys(row) as keys:
+            return known(keys, robot)
 
     def admit(self, row: MapRow, author: Author, *, by: str) -> None:
         """Admit a key by an operator's word."""
-        with self._maps.changing(row) as changed:
-            put_key(changed.keys, author, may_return=True, by=by)
+        with self._maps.reading(row), self._maps.changing_keys(row) as keys:
+            put_key(keys, author, may_return=True, by=by)

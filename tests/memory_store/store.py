@@ -8,11 +8,12 @@ from concurrent.futures import Future
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 
-from tests.memory_store.admission import admit_registration
+from tests.memory_store.admission import Keys, admit_registration
+from tests.memory_store.attachments import MemoryAttachments
 from tests.memory_store.clock import MemoryClock
 from tests.memory_store.figures import MemoryHealth, MemoryNotes, MemoryShares, MemoryUses
 from tests.memory_store.leases import MemoryLeases
-from tests.memory_store.map import new_memory_map
+from tests.memory_store.map import MemoryMap, new_memory_map
 from tests.memory_store.maps import MemoryMaps
 from tests.memory_store.robot_keys import MemoryAdmittedKeys
 from tests.memory_store.snapshot import MemorySnapshot
@@ -25,7 +26,7 @@ from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import CairnError, NotFoundError, UnreachableError
 from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
-from cairn_server.map_refusals import GoneMap, check_same_map
+from cairn_server.map_refusals import GoneMap, check_layer_count, check_same_layer, check_same_map
 from cairn_server.store.admission import OWN_WORD, Grounds
 from cairn_server.store.replica_notes import FoldHint, ReplicaNotes
 from cairn_server.store.store import Store
@@ -57,6 +58,7 @@ class MemoryStore:
         self.health = MemoryHealth(self._maps, self.age)
         self.uses = MemoryUses(self._maps)
         self.shares = MemoryShares(self._maps)
+        self.attachments = MemoryAttachments(self._maps)
         self.notes = MemoryNotes(self._maps)
 
     def create_map(
@@ -80,6 +82,8 @@ class MemoryStore:
     def delete_map(self, row: MapRow, *, by: str) -> GoneMap:
         """Take a map out of the store for good, and end its tokens."""
         with self._maps.locked() as maps, self._maps.changing(row):
+            for layer in self.layers(row):
+                self.delete_map(layer, by=by)
             gone = GoneMap(number=row.number, name=row.name, deleted_s=time.time(), by=by)
             self._maps.gone.append(gone)
             del maps[row.name]
@@ -94,6 +98,10 @@ class MemoryStore:
         """All maps, by name."""
         with self._maps.locked() as maps:
             return [maps[name].row for name in sorted(maps)]
+
+    def layers(self, row: MapRow) -> list[MapRow]:
+        """Further layers of a map, by name."""
+        return [each for each in self.maps() if each.name.startswith(f"{row.name}.")]
 
     def heads(self, numbers: Collection[int] | None = None) -> list[tuple[MapRow, Cursor]]:
         """All maps, or those of these numbers that there are, with their present states."""
@@ -118,8 +126,26 @@ class MemoryStore:
 
     def append(self, row: MapRow, commit: NewCommit) -> bool:
         """Keep a commit; True if it is new, False if the same one is known already."""
-        with self._maps.changing(row) as changed:
-            return changed.append(commit, age_s=self.age.now_s())
+        with self._maps.changing_keys(row) as keys, self._maps.changing(row) as changed:
+            return self._append(changed, commit, keys)
+
+    def _append(self, changed: MemoryMap, commit: NewCommit, keys: Keys) -> bool:
+        """Keep a commit, and begin the layer that it defines."""
+        row, layer = changed.row, commit.layer
+        others = {each.name: each.layer for each in self.layers(row)}
+        name = f"{row.name}.{layer.name}" if layer is not None else ""
+        if layer is not None and commit.id not in changed.commits:
+            if name in others:
+                check_same_layer(name, others[name], layer)
+            else:
+                check_layer_count(row.name, len(others))
+        is_new = changed.append(commit, age_s=self.age.now_s(), keys=keys)
+        if is_new and layer is not None and name not in others:
+            with self._maps.locked() as maps:
+                self._maps.made += 1
+                grid = MapLayer(geometry=layer.geometry, epoch_s=layer.epoch_s)
+                maps[name] = new_memory_map(self._maps.made, name, grid, row.sensor_model, row)
+        return is_new
 
     def submit(self, row: MapRow, commit: NewCommit) -> Future[bool]:
         """Keep a commit, at once."""
@@ -132,9 +158,9 @@ class MemoryStore:
 
     def append_built(self, row: MapRow, author: Author, build: Callable[[int], NewCommit]) -> NewCommit:
         """Keep a commit that `build(n)` makes for the author's next number n."""
-        with self._maps.changing(row) as changed:
+        with self._maps.changing_keys(row) as keys, self._maps.changing(row) as changed:
             commit = build(changed.next_number(author))
-            changed.append(commit, age_s=self.age.now_s())
+            self._append(changed, commit, keys)
             return commit
 
     def pending(
@@ -203,9 +229,9 @@ class MemoryStore:
 
     def register(self, row: MapRow, branch: Branch, token_hash: bytes, grounds: Grounds = OWN_WORD) -> None:
         """Make a branch and its token, or give an existing one another secret."""
-        with self._maps.changing(row) as changed:
+        with self._maps.changing_keys(row) as keys, self._maps.changing(row) as changed:
             author = Author(RobotName(branch.name), Incarnation(branch.incarnation))
-            admit_registration(changed.keys, author, grounds)
+            admit_registration(keys, author, grounds)
             known = changed.branches.get(branch.name)
             # A new incarnation may have lost its disk: where it stands is not known before it fetches.
             cursor = known.cursor if known and known.incarnation == branch.incarnation else None

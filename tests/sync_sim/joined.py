@@ -9,6 +9,7 @@ from random import Random
 
 from tests.fixtures.client.made import PLAIN, WITH_EPOCHS, cells_of
 from tests.sync_sim.events import Events
+from tests.sync_sim.layers import add_layer, has_layers, layers_by_definition, layers_of
 from tests.sync_sim.marks import (
     MarkFollower,
     any_marks,
@@ -82,6 +83,7 @@ class JoinedHistory:
         self._log = log
         self._notes = 0
         self._has_marks = has_marks(seed)
+        self._has_layers = has_layers(seed)
         self._follower = MarkFollower()
         self._has_forgotten = False
         self._keys: dict[str, None] = {}
@@ -136,6 +138,8 @@ class JoinedHistory:
         getattr(self, f"_{name}")()
         if self._has_marks:
             self._mark()
+        if self._has_layers and self._more.random() < 0.2:
+            add_layer(self._more.choice(self._servers), self._more)
         self._check_bases()
         self._more.choice(self._robots).check_view()
 
@@ -305,6 +309,8 @@ class JoinedHistory:
             marks = marks_by_definition(server)
             assert marks_of(server) == marks == marks_of(self._servers[0]), f"server {n} has other marks"
             assert self._follower.followed(server) == marks, "who follows the marks has others"
+            layers = layers_by_definition(server)
+            assert layers_of(server) == layers == layers_of(self._servers[0]), f"server {n} has other layers"
         for robot in self._robots:
             assert cells_of(robot.replica.view) == expected, f"{robot.name} has another map than the servers"
         self._log(f"settled with {len(held)} commits in {len(expected)} cells")

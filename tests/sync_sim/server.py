@@ -68,7 +68,8 @@ class SimServer:
         self.layer = layer
         self.settings = Settings()
         self._stable = StableBackup()
-        self._backup: MemoryMap | None = None
+        self._backup: dict[str, MemoryMap] = {}
+        """The map and its layers, by name; empty: there is no backup."""
         self._evidence: dict[CommitId, tuple[CommitMeta, dict[CellKey, bytes]]] = {}
         """Meta and diff of every commit that was ever here: a server may forget them, a test may not."""
         self.states: dict[Cursor, Fingerprints] = {}
@@ -77,7 +78,7 @@ class SimServer:
 
     def replace(self) -> None:
         """Another server, with nothing on it, under the same name."""
-        self._backup, self._stable.vector = None, EMPTY
+        self._backup, self._stable.vector = {}, EMPTY
         self._start(MemoryStore())
         self.service.maps.create(MAP, CreateMap(geometry=self.layer.geometry, epoch_s=self.layer.epoch_s))
         self._note_state()
@@ -88,20 +89,20 @@ class SimServer:
 
     def back_up(self) -> None:
         """Make a backup, and throw older ones away: what it holds is stable."""
-        state = self._store._maps.shared(self.row)
-        self._backup, self._stable.vector = state, MemorySnapshot(state).vector_at(state.head.seq)
+        self._backup = {row.name: self._store._maps.shared(row) for row in self._store.maps()}
+        state = self._backup[MAP]
+        self._stable.vector = MemorySnapshot(state).vector_at(state.head.seq)
 
     def restore(self) -> None:
         """Put the backup in the place of the store, and start on it."""
-        if self._backup is not None:
+        if self._backup:
             self.restore_under_readers()
             self._start(self._store)
 
     def restore_under_readers(self) -> None:
         """Put the backup in the place of the store while the server goes on, as a failover to an old copy does."""
-        if self._backup is not None:
-            with self._store._maps.locked() as maps:
-                maps[MAP] = self._backup.copied()
+        if self._backup:
+            self._put_maps(self._backup)
 
     def trust(self, keys: str) -> None:
         """Obey the operators of servers with these keys."""
@@ -110,12 +111,19 @@ class SimServer:
 
     def copy_of(self, other: "SimServer") -> None:
         """Another server in this one's place, that starts from a backup of a third."""
-        self._backup, self._stable.vector = None, EMPTY
-        state = other._store._maps.shared(other.row)
+        self._backup, self._stable.vector = {}, EMPTY
+        states = {row.name: other._store._maps.shared(row) for row in other._store.maps()}
         self._start(MemoryStore())
-        with self._store._maps.locked() as maps:
-            maps[MAP] = state.copied()
+        self._put_maps(states)
         self._evidence |= other._evidence
+
+    def _put_maps(self, states: dict[str, MemoryMap]) -> None:
+        """Put these maps in the place of all that the store has."""
+        with self._store._maps.locked() as maps:
+            maps.clear()
+            maps.update({name: state.copied() for name, state in states.items()})
+            # Numbers are given once, also of maps that are lost.
+            self._store._maps.made = max([self._store._maps.made, *(state.row.number for state in states.values())])
 
     def hand_over(self, commit: SignedCommit, *, by: Caller) -> None:
         """A relay brings a commit."""

@@ -1,4 +1,4 @@
-"""Parts that all commands share: parsers, subcommands, tokens, maps by URL, output for people.
+"""Parts that all commands share: parsers, subcommands, tokens, maps by URL, grids, output for people.
 
 All commands follow one protocol. The module behind an entry point of `cairn.commands` has `main(argv) -> int`, which
 parses the arguments and returns the exit code. The module of a subcommand has `add_parser(commands)`, which adds a
@@ -17,7 +17,9 @@ from cairn_client.http.api import MapApi
 from cairn_client.http.map_url import split_map_url
 from cairn_client.http.origin_tokens import NO_TOKENS, OriginTokens
 from cairn_client.sync.responses import shown_text
+from cairn_map.epochs.epoch import EPOCH_S_MAX, STANDARD_EPOCH_S
 from cairn_map.errors import EXIT_CODES, BadInputError
+from cairn_map.evidence.channels import COLOUR, INTENSITY, TEMPERATURE, Channel, ChannelKind
 
 TOKEN_VARIABLE = "CAIRN_TOKEN"  # noqa: S105 - the variable's name
 NEGATIVE = re.compile(r"-\d[-\d.]*[,:][-\d.,:]*|-[xyz]")
@@ -28,6 +30,17 @@ SECONDS = re.compile(r"\d{9,11}(\.\d+)?")
 
 AGE = re.compile(r"(\d{1,6}(?:\.\d+)?)([smhd])")
 UNITS_S = {"s": 1, "m": 60, "h": 3600, "d": 86_400}
+
+NO_EPOCHS = "none"
+EPOCH_HELP = (
+    "seconds of capture whose evidence is one sum. Sums of different epochs are kept apart, and newer ones outweigh "
+    "older: what came or went shows in the next epoch, and the map as it was, and what changed since, can be asked "
+    "for. Each epoch in which a cell is seen costs about the bytes of one pass (`cairn map info` shows them); shorter "
+    f"epochs notice sooner. {STANDARD_EPOCH_S} suits people, doors and goods. `{NO_EPOCHS}`: one sum for all times, "
+    "with the fewest bytes, for scenes that stand still, since a wall seen 200 times and then gone stays for 200 "
+    "scans. Fixed for the map's life"
+)
+CHANNELS = {"colour": COLOUR, "intensity": INTENSITY, "temperature": TEMPERATURE}
 
 Subparsers: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 Run: TypeAlias = Callable[[argparse.Namespace], int]
@@ -199,3 +212,44 @@ def seconds_of(text: str | None, *, now: datetime | None = None) -> float | None
         "bad_time",
         f"a time is 14:05, 2026-11-20T14:05 or 2026-11-20T14:05+01:00 (else UTC), or seconds since 1970; got {text!r}",
     )
+
+
+def epoch_s_from_text(text: str | None, *, otherwise: int | None = STANDARD_EPOCH_S) -> int | None:
+    """Length of an epoch, seconds, or None for a map without.
+
+    Raises:
+        BadInputError: kind `bad_epoch`.
+    """
+    if text is None:
+        return otherwise
+    if text == NO_EPOCHS:
+        return None
+    if not text.isascii() or not text.isdigit() or not 1 <= int(text) <= EPOCH_S_MAX:
+        raise BadInputError(
+            "bad_epoch", f"--epoch takes whole seconds from 1 to {EPOCH_S_MAX}, or `{NO_EPOCHS}`; got {text!r}"
+        )
+    return int(text)
+
+
+def channels_from_text(text: str) -> tuple[Channel, ...]:
+    """Channels of a text such as `colour,dose:uSv/h:0.01`; of an empty one none.
+
+    Raises:
+        BadInputError: kind `bad_channel`.
+    """
+    return tuple(map(_channel, text.split(","))) if text else ()
+
+
+def _channel(text: str) -> Channel:
+    """`colour`, `intensity`, `temperature`, or a scalar `name:unit:step`."""
+    if text in CHANNELS:
+        return CHANNELS[text]
+    name, *rest = text.split(":")
+    try:
+        unit, step = rest
+        return Channel(kind=ChannelKind.SCALAR, name=name, unit=unit, step=float(step))
+    except ValueError as exc:
+        raise BadInputError(
+            "bad_channel",
+            f"a channel is {', '.join(CHANNELS)}, or a scalar NAME:UNIT:STEP such as dose:uSv/h:0.01; got {text!r}",
+        ) from exc

@@ -24,12 +24,13 @@ from cairn_client.cli.arguments import add_token, parser, say
 from cairn_client.http.backoff import Backoff
 from cairn_client.http.map_url import split_map_url
 from cairn_client.http.origin_tokens import OriginTokens
+from cairn_client.relay.carried_attachments import hand_over_attachments
 from cairn_client.relay.carried_commits import CarriedCommits
 from cairn_client.relay.link import RelayApi, ServerEnd, hold_between
 from cairn_client.relay.round import AT_ONCE, REST_S, RelayReport, RelaySide, Undelivered, log_report, relay_round
 from cairn_client.sync.uploads import CAME_IN_PART
 from cairn_map.errors import BadInputError, CairnError, UnreachableError
-from cairn_map.wire.relay_peer import MapEnd
+from cairn_map.wire.relay_peer import AttachmentEnd
 
 log = logging.getLogger(__name__)
 
@@ -70,7 +71,7 @@ def main(argv: list[str]) -> int:
     return int(bool(report.kept_back or report.refused or report.split or any(map(resting.may_come_later, RelaySide))))
 
 
-def _once(here: MapEnd, there: MapEnd, resting: Undelivered, *, map_name: str, where: str) -> RelayReport:
+def _once(here: AttachmentEnd, there: AttachmentEnd, resting: Undelivered, *, map_name: str, where: str) -> RelayReport:
     """Rounds until there is nothing more to hand over; the sum of their reports."""
     total, backoff, cuts = RelayReport(has_more=True), Backoff(), 0
     while total.has_more:
@@ -88,12 +89,14 @@ def _once(here: MapEnd, there: MapEnd, resting: Undelivered, *, map_name: str, w
                 raise error
             time.sleep(backoff.next_s(error.retry_after_s))
             total.has_more = True
+    while hand_over_attachments(here, there):
+        pass
     say(f"map {map_name}: {total.moved[RelaySide.THERE]} commits to {where}, {total.moved[RelaySide.HERE]} from there")
     return total
 
 
 @contextmanager
-def _place(text: str, tokens: OriginTokens, map_name: str, *, size_bytes_max: int) -> Iterator[MapEnd]:
+def _place(text: str, tokens: OriginTokens, map_name: str, *, size_bytes_max: int) -> Iterator[AttachmentEnd]:
     if "://" not in text:
         yield CarriedCommits(Path(text), map_name, size_bytes_max=size_bytes_max)
         return

@@ -24,7 +24,7 @@ from pydantic import ValidationError
 
 from cairn_client.cli.arguments import Run, Subparsers, add_token, run_subcommand, say
 from cairn_client.http.api import MapApi
-from cairn_map.commits.ids import robot_name
+from cairn_map.commits.ids import map_name, robot_name
 from cairn_map.errors import BadInputError, first_error
 from cairn_map.wire.access_messages import CreateToken, RoleText, TokenInfo
 from cairn_map.wire.utc_times import with_utc
@@ -138,7 +138,8 @@ def _confirm(args: argparse.Namespace) -> int:
 
 def _name(text: str) -> str:
     """A token's name: one that was chosen, or MAP:ROBOT of a registration."""
-    return ":".join(robot_name(part) for part in text.split(":", 1))
+    first, colon, robot = text.partition(":")
+    return f"{map_name(first)}:{robot_name(robot)}" if colon else robot_name(first)
 
 
 def _shown_time(time_s: float | None, otherwise: str) -> str:

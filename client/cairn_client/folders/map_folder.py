@@ -19,12 +19,14 @@ from cairn_map.codec.cell_reading import EVIDENCE_BYTES_MAX
 from cairn_map.codec.layer_code import row_bodies
 from cairn_map.epochs.epoch import BASE, begin_s
 from cairn_map.epochs.history_map import HistoryMap
+from cairn_map.epochs.layer import EVIDENCE
 from cairn_map.epochs.map_reading import BlockTimes
-from cairn_map.errors import BadInputError
+from cairn_map.errors import BadInputError, NotFoundError
 from cairn_map.evidence.grid import CellKey, cell_of_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.files.cell_folder import MAP_FILE, cell_path, read_cells, read_head
 from cairn_map.machine_memory import standard_limit_bytes
+from cairn_map.queries.layered_snapshot import LayeredSnapshot
 from cairn_map.queries.map_snapshot import MapSnapshot, snapshot_at, snapshot_of
 from cairn_map.render.map_picture import Ages
 from cairn_map.wire.messages import MapInfo
@@ -73,6 +75,57 @@ def open_map(
 def open_part(map_url: str, needs: Needs, *, token: str | None = None, at_s: float | None = None) -> MapSnapshot:
     """The cells of a server's map that a question needs; raises as `open_map`."""
     return _downloaded_map(map_url, token, standard_limit_bytes(), at_s, needs)
+
+
+def open_layers(
+    map_url: str, *, token: str | None = None, memory_bytes_max: int | None = None, at_s: float | None = None
+) -> LayeredSnapshot:
+    """All layers of a server's map as one snapshot, in which the finest that knows a point answers for it.
+
+        open_layers("http://base:8750/maps/lab").probability_at([[1.0, 2.0, 0.4]])
+
+    Args:
+        map_url: `http://HOST:PORT/maps/NAME`.
+        token: for a server that wants one.
+        memory_bytes_max: largest size in memory of all layers together; None: a quarter of the machine's memory.
+        at_s: UTC seconds since 1970: the map as it was then, as `open_map`.
+
+    Raises:
+        BadInputError: kind `layer_of_map`: the URL is that of a layer, which `open_map` opens.
+        CairnError: as `open_map`.
+    """
+    return layers_part(map_url, None, token=token, memory_bytes_max=memory_bytes_max, at_s=at_s)
+
+
+def layers_part(
+    map_url: str,
+    needs: Needs | None,
+    *,
+    token: str | None = None,
+    memory_bytes_max: int | None = None,
+    at_s: float | None = None,
+) -> LayeredSnapshot:
+    """The cells of all layers that a question needs, or (None) all; raises as `open_layers`."""
+    server_url, name = split_map_url(map_url)
+    with MapApi(server_url, token=token) as api:
+        layers = _layers_of(api, name)
+    share_bytes = (memory_bytes_max or standard_limit_bytes()) // len(layers)
+    return LayeredSnapshot(
+        {
+            layer: _downloaded_map(f"{server_url}/maps/{map_name}", token, share_bytes, at_s, needs)
+            for layer, map_name in layers.items()
+        }
+    )
+
+
+def _layers_of(api: MapApi, name: str) -> dict[str, str]:
+    """Name of each layer of a map, and the one that it is asked for by."""
+    try:
+        return {layer.name: layer.map for layer in api.layers(name)}
+    except NotFoundError as exc:
+        if exc.kind != "no_route":
+            raise
+        return {EVIDENCE: name}  # a server of before has maps of one layer
 
 
 def map_of_folder(folder: Path, *, at_s: float | None = None) -> FolderMap:

@@ -5,10 +5,6 @@ again later, is `UnreachableError`. Every call is idempotent, so a caller may si
 httpx is loaded with the first `MapApi`: it is a seventh of the import of a robot, by processor time (tests/bench).
 """
 
-import contextlib
-import socket
-import threading
-import weakref
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,9 +14,10 @@ from typing import TYPE_CHECKING, Any, Self
 from pydantic import TypeAdapter, ValidationError
 
 from cairn_client.http.answer_reading import CODING, body_of_error, header_text, parts_of, sent_again, time_sample
+from cairn_client.http.open_sockets import OpenSockets
 from cairn_client.http.origin_tokens import without_token
 from cairn_client.http.request_deadline import PACE, Pace, RequestDeadline
-from cairn_client.http.url_scheme import certificate_end_s, other_scheme, speaks_tls, unreachable
+from cairn_client.http.url_scheme import other_scheme, speaks_tls, unreachable
 from cairn_client.sync.requests import Box, GetUpload, PutPart
 from cairn_client.sync.responses import (
     Answer,
@@ -31,11 +28,12 @@ from cairn_client.sync.responses import (
     list_of,
     narrower,
 )
+from cairn_map.commits.attachment import Attachment
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.cursor import cursor_from_text
 from cairn_map.commits.ids import Author, CommitId
 from cairn_map.commits.version_vector import EMPTY, VersionVector, vector_digest, version_vector_from_json
-from cairn_map.errors import BadInputError, CairnError, DamagedDataError, UnreachableError, first_error
+from cairn_map.errors import BadInputError, CairnError, DamagedDataError, first_error
 from cairn_map.evidence.fingerprint import fingerprint_from_hex
 from cairn_map.evidence.grid import Cell
 from cairn_map.machine_clocks import MACHINE_CLOCKS
@@ -54,7 +52,8 @@ from cairn_map.wire.change_messages import ChangesAnswer
 from cairn_map.wire.frames import FRAME_BYTES_MAX, JSON_BYTES_MAX, Frame
 from cairn_map.wire.hot_spot_messages import HotSpotsAnswer
 from cairn_map.wire.hottest_messages import HottestAnswer
-from cairn_map.wire.mark_messages import MarkPage, MarkReceipt, MarkRequest
+from cairn_map.wire.layer_messages import LAYER_FORMAT, AddLayer, LayerAdded, LayerInfo
+from cairn_map.wire.mark_messages import AttachmentState, MarkPage, MarkReceipt, MarkRequest, WantedAttachments
 from cairn_map.wire.messages import (
     INDEX_PAGE,
     BranchInfo,
@@ -80,16 +79,13 @@ from cairn_map.wire.messages import (
 from cairn_map.wire.origins import origin_of
 from cairn_map.wire.resumed_replies import Replies
 
-OPENED = ("connection.connect_tcp.complete", "connection.start_tls.complete")
-
 if TYPE_CHECKING:
     import ssl
 
-if TYPE_CHECKING:
     import httpx
 
 PROTOCOL_VERSION = "1"
-FORMAT_VERSION = "2"
+FORMAT_VERSION = str(LAYER_FORMAT)
 """Newest version of cells and commits that is read; without it a server takes a client for one of version 1."""
 TIMEOUT_S, CONNECT_S = 30.0, 5.0
 NO_CONTENT, NOT_MODIFIED = 204, 304
@@ -114,57 +110,6 @@ def certificates(ca_file: Path | None) -> "ssl.SSLContext | bool":
         return ssl.create_default_context(cafile=ca_file) if ca_file else True
     except OSError as exc:  # ssl.SSLError is one
         raise BadInputError("bad_setting", f"{ca_file} is no file of certificates: {exc}") from exc
-
-
-class OpenSockets:
-    """Sockets that a client opened; `watch` is to be called with each request (httpx's event hook)."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._sockets: weakref.WeakSet[socket.socket] = weakref.WeakSet()
-        self.is_cut = False
-        """True while nothing is to be sent."""
-        self.certificate_end_s: float | None = None
-        """End of the certificate that the server showed last, UTC seconds since 1970; None: it showed none."""
-
-    def watch(self, request: Any) -> None:
-        """Note the connection that a request makes, if it makes one.
-
-        Raises:
-            UnreachableError: kind `interrupted`: nothing is to be sent any more.
-        """
-        self._check()
-        request.extensions = {**request.extensions, "trace": self._trace}
-
-    def cut(self) -> None:
-        """End all that is under way, and let nothing begin until `mend`; by any thread."""
-        self.is_cut = True
-        self.break_off()
-
-    def break_off(self) -> None:
-        """End all that is under way; by any thread."""
-        with self._lock:
-            for found in list(self._sockets):
-                with contextlib.suppress(OSError):
-                    # The plain socket's: that of TLS would say goodbye first.
-                    socket.socket.shutdown(found, socket.SHUT_RDWR)
-
-    def mend(self) -> None:
-        """Requests may be sent again; each makes a connection of its own if it must."""
-        self.is_cut = False
-
-    def _trace(self, name: str, info: Mapping[str, Any]) -> None:
-        if name in OPENED:
-            found = info["return_value"].get_extra_info("socket")
-            self.certificate_end_s = certificate_end_s(found)
-            with self._lock:
-                if isinstance(found, socket.socket):
-                    self._sockets.add(found)
-            self._check()
-
-    def _check(self) -> None:
-        if self.is_cut:
-            raise UnreachableError("interrupted", "the robot is being closed")
 
 
 class MapApi:
@@ -419,6 +364,30 @@ class MapApi:
         """Add, change or remove a mark, as an operator."""
         body = self._ask("POST", f"/maps/{name}/main/marks", content=request.model_dump_json().encode())
         return message_from_json(MarkReceipt, body)
+
+    def layers(self, name: str) -> list[LayerInfo]:
+        """The layers of a map: the one that it began with, then the others by name."""
+        return list_of(LayerInfo, self._ask("GET", f"/maps/{name}/layers"))
+
+    def add_layer(self, name: str, request: AddLayer) -> LayerAdded:
+        """Add a layer to a map, as an operator; an equal one stays as it is."""
+        body = self._ask("POST", f"/maps/{name}/layers", content=request.model_dump_json().encode())
+        return message_from_json(LayerAdded, body)
+
+    def wanted_attachments(self, name: str, *, robot: str | None = None) -> WantedAttachments:
+        """Attachments of marks that the server lacks: all, or those that a robot may have."""
+        params = {} if robot is None else {"robot": robot}
+        return message_from_json(WantedAttachments, self._ask("GET", f"/maps/{name}/main/attachments", params=params))
+
+    def attachment(self, name: str, sha256: str) -> bytes:
+        """Bytes of an attachment; `attachment_copy` compares their SHA-256."""
+        return self._ask("GET", f"/maps/{name}/main/attachments/{sha256}")
+
+    def put_attachment_part(self, name: str, attached: Attachment, data: bytes, *, offset: int) -> AttachmentState:
+        """Send a part of an attachment."""
+        path, params = f"/maps/{name}/main/attachments/{attached.sha256}", {"total": f"{attached.size_bytes}"}
+        body = self._ask("PATCH", path, content=data, params=params | {"offset": f"{offset}"})
+        return message_from_json(AttachmentState, body)
 
     def vector_at(self, name: str, cursor: str) -> VersionVector:
         """The ids that a server had folded at a cursor."""

@@ -1,13 +1,13 @@
-"""URL of a map: `http://HOST:PORT/maps/NAME`."""
+"""URL of a map: `http://HOST:PORT/maps/NAME`; of one of its layers `http://HOST:PORT/maps/NAME.LAYER`."""
 
 from urllib.parse import urlsplit
 
-from cairn_map.commits.ids import robot_name
+from cairn_map.commits.ids import map_name
 from cairn_map.errors import BadInputError
 
 
 def split_map_url(map_url: str) -> tuple[str, str]:
-    """Server and map of `http://HOST:PORT/maps/NAME`.
+    """Server and map, or layer, of `http://HOST:PORT/maps/NAME`.
 
     Raises:
         BadInputError: it is not of that form.
@@ -20,4 +20,4 @@ def split_map_url(map_url: str) -> tuple[str, str]:
     head, _, name = parts.path.rstrip("/").rpartition("/maps/")
     if parts.scheme not in ("http", "https") or not is_host or not name or "/" in name:
         raise BadInputError("bad_url", f"a map's URL is http://HOST:PORT/maps/NAME, got {map_url[:200]!r}")
-    return f"{parts.scheme}://{parts.netloc}{head}", robot_name(name)
+    return f"{parts.scheme}://{parts.netloc}{head}", map_name(name)

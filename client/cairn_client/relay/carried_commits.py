@@ -1,6 +1,7 @@
 """Carried commits: others' commits in a folder of a robot, with a file for each, on their way to the next server.
 
     mole.1f2e3d4c5b6a7988.7      the signatures, a line feed, the commit's bytes; empty once there was no room for it
+    attachments/                 what their marks name (`attachment_folder`)
 
 The folder is one end of a relay, like a server. Its commits are on some server, too, so when it is full the oldest are
 emptied; their names stay, so that they are not fetched again.
@@ -10,8 +11,12 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+from cairn_client.relay.carried_attachments import hand_over_attachments
 from cairn_client.relay.link import RelayApi, ServerEnd, hold_between
 from cairn_client.relay.round import RelayReport, Undelivered, log_report, relay_round
+from cairn_client.replica.attachment_folder import ATTACHMENTS, AttachmentFolder
+from cairn_map.commits.attachment import Attachment
+from cairn_map.commits.commit import CommitMeta
 from cairn_map.commits.commit_reading import validated_commit
 from cairn_map.commits.ids import INITIAL, OPERATOR, CommitId, commit_id_from_text
 from cairn_map.commits.signature import TEXT_MAX, check_signatures, signatures_from_text, speaks_for
@@ -25,6 +30,9 @@ SERVERS_OWN = (OPERATOR, INITIAL)
 """Authors in whose name servers speak, by keys that only a server knows whether to trust."""
 COMING = ".coming"
 """Suffix of the name of a file that is not whole."""
+ATTACHMENTS_SHARE = 4
+"""A quarter of the folder's room is for attachments of marks."""
+ATTACHMENTS_BYTES_MAX = 1 << 32
 
 
 class CarriedCommits:
@@ -39,6 +47,9 @@ class CarriedCommits:
         self._folder = folder
         self._map_name = map_name
         self._size_bytes_max = size_bytes_max
+        self._attachments = AttachmentFolder(
+            folder / ATTACHMENTS, size_bytes_max=min(size_bytes_max // ATTACHMENTS_SHARE, ATTACHMENTS_BYTES_MAX)
+        )
         try:
             folder.mkdir(0o700, parents=True, exist_ok=True)
         except OSError as exc:
@@ -77,7 +88,7 @@ class CarriedCommits:
             BadInputError: not what its author signed: kept, it would keep the true one out; or larger than all room.
             DamagedDataError: no sound commit.
         """
-        self._check(commit)
+        meta = self._check(commit)
         content = (commit.signatures or "").encode() + b"\n" + commit.data
         path = self._folder / str(commit.id)
         coming = path.with_name(path.name + COMING)
@@ -89,10 +100,30 @@ class CarriedCommits:
                 os.fsync(file.fileno())
             coming.replace(path)
             _sync_folder(self._folder)
+            for mark in meta.marks:
+                if mark.attachment is not None:
+                    self._attachments.await_one(mark.attachment)
         except OSError as exc:
             raise UnreachableError("store_failed", f"cannot write to {self._folder}: {exc.strerror}") from exc
 
-    def _check(self, commit: SignedCommit) -> None:
+    def has_attachments(self) -> bool:
+        """True if any are here."""
+        return bool(self._attachments.names())
+
+    def wanted_attachments(self) -> list[Attachment]:
+        """Attachments that carried marks name and that did not come here."""
+        return self._attachments.awaited()
+
+    def attachment(self, attachment: Attachment) -> bytes | None:
+        """Bytes of an attachment; None if they are not here."""
+        return self._attachments.read(attachment.sha256)
+
+    def keep_attachment(self, attachment: Attachment, data: bytes) -> None:
+        """Carry an attachment; the oldest ones give way to it."""
+        self._attachments.make_room(len(data))
+        self._attachments.keep(data)
+
+    def _check(self, commit: SignedCommit) -> CommitMeta:
         size_bytes = len(commit.signatures or "") + 1 + len(commit.data)
         if size_bytes > self._size_bytes_max:
             raise BadInputError(
@@ -105,11 +136,12 @@ class CarriedCommits:
         check_signatures(signed, self._map_name, found.sha)
         if commit.id.author.robot not in SERVERS_OWN and not speaks_for(signed, commit.id.author):
             raise BadInputError("bad_signature", f"{commit.id} is not signed by its author")
+        return found.meta
 
     def _make_room(self, size_bytes: int) -> None:
         """Empty the oldest files until so many bytes fit."""
         found = sorted((path.stat().st_mtime_ns, path) for _, path in self._files())
-        total = sum(path.stat().st_size for _, path in found) + size_bytes
+        total = sum(path.stat().st_size for _, path in found) + size_bytes + self._attachments.size_bytes()
         for _, path in found:
             if total <= self._size_bytes_max:
                 return
@@ -149,6 +181,8 @@ class Carrier:
         """
         report = hold_between(relay_round(self._resting), self._here, self._there)
         log_report(report, self._map_name, there="the server")
+        if not report.cut:
+            hand_over_attachments(self._here, self._there)
         if report.cut:
             raise report.cut
         return report

@@ -5,11 +5,13 @@ from typing import Any, TypeVar
 
 from cairn_client.http.answer_reading import sent_again
 from cairn_client.http.api import MapApi
+from cairn_client.http.attachment_copy import fetched_attachment, send_attachment
 from cairn_client.http.http_link import Link
 from cairn_client.relay.round import AskHeld, GiveCommit, RelaySide, TakeCommit
 from cairn_client.sync.requests import Ask, Conversation, GetUpload, hold
 from cairn_client.sync.uploads import PARTS as LARGER_PARTS
 from cairn_client.sync.uploads import CommitUpload, push_rest
+from cairn_map.commits.attachment import Attachment
 from cairn_map.commits.ids import CommitId
 from cairn_map.wire.messages import message_from_json
 from cairn_map.wire.relay_peer import CommitList, Held, MapEnd, SignedCommit, held_from_list
@@ -62,6 +64,22 @@ class ServerEnd:
                 Link(self._api, self._map_name, branch="").hold(push_rest(upload, found.size_bytes, PARTS))
                 return
         self._api.hand_over(self._map_name, commit)  # what is there already is compared
+
+    def has_attachments(self) -> bool:
+        """True: the other place says first what it wants."""
+        return True
+
+    def wanted_attachments(self) -> list[Attachment]:
+        """Attachments that marks of the map name and the server lacks."""
+        return self._api.wanted_attachments(self._map_name).wanted
+
+    def attachment(self, attachment: Attachment) -> bytes | None:
+        """Bytes of an attachment; None if the server does not have them."""
+        return fetched_attachment(self._api, self._map_name, attachment.sha256)
+
+    def keep_attachment(self, attachment: Attachment, data: bytes) -> None:
+        """Send an attachment, in parts that go on where a cut left them."""
+        send_attachment(self._api, self._map_name, attachment, data)
 
 
 def hold_between(conversation: Conversation[T], here: MapEnd, there: MapEnd) -> T:

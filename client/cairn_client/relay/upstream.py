@@ -11,8 +11,10 @@ import time
 
 from cairn_client.http.backoff import Backoff
 from cairn_client.http.request_deadline import PACE, Pace
+from cairn_client.relay.carried_attachments import hand_over_attachments
 from cairn_client.relay.link import RelayApi, ServerEnd, hold_between
 from cairn_client.relay.round import RelayReport, RelaySide, Undelivered, log_report, relay_round
+from cairn_map.commits.ids import map_of_layer
 from cairn_map.errors import CairnError, DeniedError, NotFoundError, UnreachableError
 from cairn_map.wire.messages import MapInfo
 from cairn_map.wire.relay_peer import TOO_MANY_MAPS, OwnServer
@@ -101,7 +103,9 @@ class Upstream:
         own = set(self._server.map_names())
         for name in sorted(own - {info.name for info in found}):
             self._server.note_round(name, NotFoundError("no_map", "the upstream server has no such map for this token"))
-            self._say(logging.WARNING, f"upstream {self._url} has no map {name} for this token; create it there")
+            # A layer comes there with the commit of its map that defines it.
+            if map_of_layer(name) is None:
+                self._say(logging.WARNING, f"upstream {self._url} has no map {name} for this token; create it there")
         has_more, cut, is_full = False, None, False
         refused: list[tuple[str, CairnError]] = []
         for info in found:
@@ -136,7 +140,8 @@ class Upstream:
         begun_s = self._server.clock_s()
         resting = self._resting.setdefault(info.name, Undelivered())
         was_refused = resting.is_refused(RelaySide.THERE)
-        report = hold_between(relay_round(resting), here, ServerEnd(self._api, info.name))
+        there = ServerEnd(self._api, info.name)
+        report = hold_between(relay_round(resting), here, there)
         log_report(report, info.name, there=self._url)
         # A refused commit rests between two tries, and is refused meanwhile.
         is_refused = was_refused or resting.is_refused(RelaySide.THERE)
@@ -144,6 +149,8 @@ class Upstream:
         self._server.note_round(info.name, ill)
         if report.is_all_there:
             self._server.handed_over(info.name, begun_s)
+        if not report.cut:
+            report.has_more |= hand_over_attachments(here, there) > 0
         return report
 
     def _say_refused(self, refused: list[tuple[str, CairnError]]) -> None:

@@ -28,8 +28,8 @@ class Limits:
 
     disk_bytes_max: int | None = None
     """Largest size of the pages in use in the robot's file: commits, cells, and some 200 bytes of each commit ever
-    made. Its write-ahead log, up to 64 MB, comes on top, and the file does not become smaller by itself: its free pages
-    are used again."""
+    made. Its write-ahead log, up to 64 MB, and attachments of marks, up to 256 MB, come on top, and the file does not
+    become smaller by itself: its free pages are used again."""
     outbox_bytes_max: int | None = None
     """Largest size of the commits whose bytes are kept: those that wait, and those that a restore of the server could
     lose."""

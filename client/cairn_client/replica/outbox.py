@@ -363,10 +363,16 @@ class Outbox:
         self._read_successors(renamed.meta.retracted_ids)
         return renamed
 
+    def named_attachments(self) -> frozenset[str]:
+        """SHA-256, hex, of the attachments that marks of commits name whose bytes are kept."""
+        noted = (self._store.get(f"{MARKS_KEY} {kept.id}") for kept in self if not kept.cells)
+        return frozenset(sha for text in noted if text for sha in text.split())
+
     def _note_marks(self, commit: Commit) -> None:
-        """Remember of a commit that it brought marks: it may be taken out when its bytes are gone."""
+        """Remember of a commit that it brought marks, and their attachments: it may be taken out without its bytes."""
         if commit.meta.marks:
-            self._store.put(f"{MARKS_KEY} {commit.id}", "")
+            attached = (mark.attachment.sha256 for mark in commit.meta.marks if mark.attachment is not None)
+            self._store.put(f"{MARKS_KEY} {commit.id}", " ".join(attached))
 
     def _naming(self, old: CommitId, new: CommitId) -> Iterator[Commit]:
         """Commits that retract a renamed one, with its new id in them; on the server the old id is another commit's.

@@ -20,6 +20,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
+from cairn_client.replica.attachment_folder import ATTACHMENTS, AttachmentFolder
 from cairn_client.replica.limits import KEEP_ACKED_S
 from cairn_client.replica.mark_copy import MarkCopy
 from cairn_client.replica.outbox import NO_FACTS, NO_NOTES, CommitFacts, Outbox
@@ -58,6 +59,8 @@ KINDS_OF_ALL = ("http", "unknown_protocol")
 """Kinds of refusals that say nothing about the commit: a portal's or proxy's, and those of every request."""
 KINDS_OF_MARKS = ("too_many_marks", "older_servers")
 """Kinds of refusals of a commit for its marks: the robot has too many, or the server's store takes none yet."""
+ATTACHMENTS_BYTES_MAX = 1 << 28
+"""Most bytes of the attachments in a robot's folder: a server takes no more of one robot, either."""
 FORGET_AT_ONCE = 32
 """Commits dropped at once for room: a few, so that no more go than must."""
 RETRACTS_AT_ONCE = 1024
@@ -150,6 +153,8 @@ class Replica:
         self.state = ReplicaState(store)
         self.marks = MarkCopy(store)
         """Marks of the server's map."""
+        self.attachments = AttachmentFolder(store.file.parent / ATTACHMENTS, size_bytes_max=ATTACHMENTS_BYTES_MAX)
+        """Bytes of the attachments of own marks, until no restore of the server can lose them."""
         self.layer = MapLayer(geometry=geometry, epoch_s=epoch_s)
         self._keep_acked_s = keep_acked_s
         self._memory_bytes_max = memory_bytes_max
@@ -300,10 +305,11 @@ class Replica:
         with self._lock:
             return self.commit({}, replace(facts, retracts=(self._standing(target),)))
 
-    def mark(self, mark: Mark, *, instead_of: CommitId | None) -> Commit:
+    def mark(self, mark: Mark, *, instead_of: CommitId | None, attached: bytes = b"") -> Commit:
         """Keep a mark, perhaps in the place of what stands for an own commit with marks; as `commit`.
 
         Raises:
+            UnreachableError: kind `outbox_full`: there is no room for its attachment.
             NotFoundError: kind `no_mark`: the commit brought no marks.
             ConflictError: kind `taken_back`, as of `retract`; or the server refuses marks of this robot, by its kind.
         """
@@ -315,7 +321,14 @@ class Replica:
             target = None if instead_of is None else self._standing(instead_of)
             if target is not None and self.outbox.knows(target) and not self.outbox.has_marks(target):
                 raise NotFoundError("no_mark", f"{target} brought no marks that another could take the place of")
+            if attached:  # before the mark that names it, so that a mark on its way has its bytes
+                self.attachments.keep(attached)
             return self.commit({}, CommitFacts(marks=(mark,), retracts=() if target is None else (target,)))
+
+    def named_attachments(self) -> frozenset[str]:
+        """SHA-256, hex, of the attachments that marks of commits name whose bytes are kept."""
+        with self._lock:
+            return self.outbox.named_attachments()
 
     def _standing(self, target: CommitId) -> CommitId:
         """Commit that stands for another one, or itself; it can be taken out."""

@@ -11,7 +11,7 @@ tables of their own in the store.
 
 import base64
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Generic, Self, TypeVar, overload
@@ -245,6 +245,19 @@ class RobotKeys:
         self._state.drawn = [*(self._state.drawn or []), key.incarnation]
         self._store.put(_signing_key(key.incarnation), key.seed.hex())
         return key.incarnation
+
+    def vouching(self) -> dict[Incarnation, bytes]:
+        """Seeds of the keys that vouch for the robot's name, by the incarnation that follows from each."""
+        older, drawn = self._drawn()
+        return {key.incarnation: key.seed for key in self._keys([*older, *drawn[:1]])}
+
+    def borrow(self, seeds: Mapping[Incarnation, bytes]) -> None:
+        """Sign with these keys, too: those of the same robot in another folder, which drew them for itself."""
+        own = self._state.drawn or []
+        with self._store.transaction():
+            for incarnation, seed in seeds.items():
+                if incarnation not in own:
+                    self._store.put(_signing_key(incarnation), seed.hex())
 
     def _drawn(self) -> tuple[list[Incarnation], list[Incarnation]]:
         """Incarnations with a key from before a list of them was kept, in no order; and that list, oldest first."""

@@ -7,18 +7,22 @@ The map is then the one that the corrected poses would have given from the start
 """
 
 from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from cairn_calib.rig.poses import check_transform
+from cairn_client.http.attachment_copy import attachment_bytes
 from cairn_client.replica.outbox import CommitFacts
 from cairn_client.replica.replica import Replica
 from cairn_client.robot.kept_scans import KeptScans
+from cairn_client.robot.map_marks import check_has_marks
 from cairn_fusion.mapping.measurement import Measurement
 from cairn_fusion.recording.scan import Scan
 from cairn_fusion.recording.scan_bytes import move_scan
 from cairn_map.codec.cell_code import Profile
+from cairn_map.commits.attachment import attachment_of
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.ids import CommitId, commit_id_from_text
 from cairn_map.commits.mark import Mark, check_place
@@ -93,10 +97,15 @@ class Amending:
         self._on_commit(commit)
         return commit
 
-    def mark(self, mark: Mark, *, instead_of: AnyCommit | None) -> Commit:
+    def mark(self, mark: Mark, *, instead_of: AnyCommit | None, attachment: Path | bytes | None) -> Commit:
         """Commit a mark, perhaps in the place of an own one; as `Robot.mark`."""
+        check_has_marks(self._replica.state.map_name or "")
         check_place(mark, self._replica.geometry)
-        commit = self._replica.mark(mark, instead_of=None if instead_of is None else commit_id_of(instead_of))
+        attached = attachment_bytes(attachment)
+        if attached:
+            mark = mark.model_copy(update={"attachment": attachment_of(attached)})
+        target = None if instead_of is None else commit_id_of(instead_of)
+        commit = self._replica.mark(mark, instead_of=target, attached=attached)
         self._on_commit(commit)
         return commit
 

@@ -9,6 +9,7 @@ from cairn_client.http.mark_pages import mark_pages
 from cairn_client.replica.mark_copy import MarkCopy
 from cairn_client.replica.replica import Replica
 from cairn_map.commits.commit import living_marks
+from cairn_map.commits.ids import map_of_layer
 from cairn_map.commits.mark import Mark
 from cairn_map.errors import BadInputError, CairnError, UnreachableError
 from cairn_map.wire.mark_messages import MarkEntry
@@ -19,12 +20,29 @@ PAGES_MAX = 200
 """Most pages that are taken at a time: a server that never comes to an end must not hold up a round for ever."""
 
 
+def check_has_marks(map_name: str) -> None:
+    """Refuse what concerns marks to a robot of a layer.
+
+    Raises:
+        BadInputError: kind `layer_of_map`.
+    """
+    whole = map_of_layer(map_name)
+    if whole is not None:
+        raise BadInputError(
+            "layer_of_map",
+            f"{map_name} is a layer of map {whole}, and marks are the map's: mark by a robot of {whole}, or as an "
+            "operator (cairn map mark)",
+        )
+
+
 def follow_marks(api: MapApi, copy: MarkCopy, map_name: str) -> None:
     """Bring the copy of a map's marks to the map's present state.
 
     Raises:
+        BadInputError: kind `layer_of_map`: it is a layer.
         CairnError: the server refuses, or there is no link; what came before stays.
     """
+    check_has_marks(map_name)
     for page in islice(mark_pages(api, map_name, after=copy.cursor), PAGES_MAX):
         copy.take(page)
 

@@ -461,6 +461,7 @@ class Robot:
         kind: str = "mark",
         extent_m: Sequence[float] = (0.0, 0.0, 0.0),
         note: str = "",
+        attachment: Path | bytes | None = None,
         instead_of: AnyCommit | None = None,
     ) -> Commit:
         """Mark a place for all robots and people of the map; durable here, elsewhere as they sync.
@@ -471,17 +472,17 @@ class Robot:
             kind: sort of thing, such as `hot_spot` or `door`.
             extent_m: edges of a box around it, metres; zeros: a point.
             note: up to 1024 characters.
+            attachment: a file or bytes, such as a picture, to 2^24 bytes: kept here, sent once the server has the mark.
             instead_of: commit of an own mark that it takes the place of; `retract` takes one out.
 
         Raises:
-            BadInputError: kind `bad_mark`, `bad_place`, or `not_own`: another's, which an operator changes.
-            CairnError: kind `no_mark` or `taken_back`: `instead_of` is no mark any more; or the server takes none.
-            UnreachableError: kind `store_failed`: the disk is full or broken.
+            BadInputError: kind `bad_mark`, `bad_place`, `bad_attachment`, `layer_of_map`; `not_own`: another's mark.
+            CairnError: kind `no_mark` or `taken_back`: of `instead_of`; `store_failed`, `outbox_full`; or the server's.
         """
         time_s = self._clock.best_s()  # the server's, if it was learnt
         mark = make_mark(kind=kind, name=name, at_m=at_m, extent_m=extent_m, note=note, time_s=time_s)
-        with self._lock:
-            return self._amending().mark(mark, instead_of=instead_of)  # durable, and pushed with the next round
+        with self._lock:  # durable, and pushed with the next round
+            return self._amending().mark(mark, instead_of=instead_of, attachment=attachment)
 
     def marks(self, box_m: Sequence[float] | None = None) -> list[MarkEntry]:
         """Marks of the map at the last round, all or in a box (metres), and own ones; the first call takes a link."""
@@ -511,9 +512,8 @@ class Robot:
             CairnError: the server refuses this robot, or its data is damaged.
         """
         self._check_open()
-        return (
-            self._rounds.sync_until_folded(on_push, within_s=within_s) if until_folded else self._rounds.sync(on_push)
-        )
+        rounds = self._rounds
+        return rounds.sync_until_folded(on_push, within_s=within_s) if until_folded else rounds.sync(on_push)
 
     def start_sync(self, *, every_s: float = 5.0) -> None:
         """Sync in the background: after each commit, and at least every so many seconds while there is a link."""

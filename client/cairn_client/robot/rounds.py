@@ -8,6 +8,7 @@ The background thread does a round after each wake-up, one every so often, and a
 """
 
 import logging
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -20,6 +21,7 @@ from cairn_client.replica.limits import Limits
 from cairn_client.replica.replica import Replica
 from cairn_client.robot.cell_budget import NO_ROOM, CellBudget
 from cairn_client.robot.map_marks import follow_marks, keep_following
+from cairn_client.robot.mark_attachments import AT_ONCE_BYTES, bring_attachments
 from cairn_client.robot.membership import Membership
 from cairn_client.robot.robot_events import Events
 from cairn_client.robot.round_watch import RoundWatch
@@ -223,6 +225,7 @@ class Rounds:
         try:
             if self._mode != "viewer" and self._replica.push_set():
                 self._membership.as_member(self._push, None)
+            self._bring_attachments(at_once_bytes=sys.maxsize)
             # Asked again after the push: a commit that is still only here must not lose its robot's place on the map.
             if is_leaving and not self._replica.push_set():
                 self._membership.leave_if_welcome_back()
@@ -253,7 +256,9 @@ class Rounds:
         if self._mode != "viewer":
             report.waiting, report.pending = self._replica.behind()
         keep_following(self._api, self._replica, self._map_name)
-        # Then others' commits, and the status, which costs nothing if it is lost.
+        # Then attachments and others' commits, and the status, which costs nothing if it is lost.
+        if self._bring_attachments(at_once_bytes=AT_ONCE_BYTES):
+            self.wake()
         if self._carrier is not None:
             self._carrier.exchange()
         # A round that ended at its limit of bytes goes on at once; commits made meanwhile have their turn first.
@@ -261,6 +266,13 @@ class Rounds:
             self.wake()
         self._status.send(self._replica, self._api, self._map_name, branch=self._branch, mode=self._mode)
         return report
+
+    def _bring_attachments(self, *, at_once_bytes: int) -> bool:
+        """Send attachments of own marks that the server wants; True if there is more to send."""
+        if self._mode == "viewer" or not self._replica.attachments.names():
+            return False
+        bring = self._membership.as_member
+        return bring(bring_attachments, self._api, self._replica, self._map_name, at_once_bytes)
 
     def _fetch(self) -> RoundReport:
         """Fetch the cells that fit: again with a smaller box when there is no room for them."""

@@ -4,7 +4,8 @@
 
 In version 2, of maps with epochs, the meta names the layers and the epoch, and each cell begins with a u8, the number
 of its layer. A cell of a commit has one row, that of the epoch, and so is a cell file of version 1 in both. A commit
-of version 3 has marks in its meta, and no cells (`mark`).
+of version 3 has marks in its meta, and no cells (`mark`); one of version 4 defines a further layer of its map, and is
+that layer's beginning (`epochs.layer`).
 
 Its SHA-256 is taken over the meta bytes and the cells' canonical digests, so that cells may be recompressed without
 changing it. A retract is a commit without cells that names others; an amend is one with both. FORMAT.md is the norm.
@@ -26,22 +27,26 @@ from cairn_map.codec.octree.cell_head import decode_head
 from cairn_map.commits.ids import CommitId, commit_id_from_text
 from cairn_map.commits.mark import AMENDED_MAX, MARKS_MAX, Mark, MarkKey
 from cairn_map.epochs.epoch import BASE, EPOCH_MAX, Epoch
-from cairn_map.epochs.layer import Hex32, LayerIdentity, MapLayer
+from cairn_map.epochs.layer import Hex32, LayerDefinition, LayerIdentity, MapLayer
 from cairn_map.errors import BadInputError, DamagedDataError, first_error
 from cairn_map.evidence.evidence import Evidence, every_sum_has_weight
 from cairn_map.evidence.grid import CellKey, Geometry
 
 MAGIC = b"CRCM"
-SUM_VERSION, EPOCH_VERSION, MARK_VERSION = 1, 2, 3
-"""Versions of a commit's bytes: of maps with one sum for all times, of maps with epochs, and with marks on any map."""
+SUM_VERSION, EPOCH_VERSION, MARK_VERSION, LAYER_VERSION = 1, 2, 3, 4
+"""Versions of a commit's bytes: of maps with one sum for all times, of maps with epochs, and on any map of commits with
+marks, and of such as define a layer."""
 EVICTION_FIELDS = frozenset({"keep_epochs", "weight_max"})
 """Fields of a layer that are reserved for maps that let old rows go."""
+NEWER = ("extra_forbidden", "literal_error")
+"""Kinds of errors in the definition of a layer by which a newer program's is known."""
 LAYERS_MAX = 1
 """Layers of a commit that this reader knows; the format has room for 16."""
 CELL_PREFIX = {
     SUM_VERSION: struct.Struct("<I"),
     EPOCH_VERSION: struct.Struct("<BI"),
     MARK_VERSION: struct.Struct("<I"),
+    LAYER_VERSION: struct.Struct("<I"),
 }
 HEAD = struct.Struct("<4sBI")
 META_BYTES_MAX = 1 << 20
@@ -108,6 +113,8 @@ class CommitMeta(BaseModel):
     note: Annotated[str, Field(max_length=1024)] = ""
     marks: Annotated[tuple[Mark, ...], Field(max_length=MARKS_MAX), FailFast()] = ()
     """Its marks, by number; only in version 3, of a commit without cells."""
+    layer: LayerDefinition | None = None
+    """Layer of the map that begins with it; only in version 4, of a commit without cells."""
     kind: Literal["commit"] = "commit"
 
     @model_validator(mode="after")
@@ -135,11 +142,15 @@ class CommitMeta(BaseModel):
                 f"{len(self.marks)} marks take the place of at most {MARKS_MAX // len(self.marks)} commits, "
                 f"got {len(self.retracts)}"
             )
+        if self.layer is not None and (self.layers or self.marks or self.retracts):
+            raise ValueError("a commit that defines a layer names its map's geometry, and holds nothing else")
         return self
 
     @property
     def version(self) -> int:
         """Version of the commit's bytes."""
+        if self.layer is not None:
+            return LAYER_VERSION
         if self.marks:
             return MARK_VERSION
         return EPOCH_VERSION if self.layers else SUM_VERSION
@@ -153,6 +164,11 @@ class CommitMeta(BaseModel):
     def row(self) -> Epoch:
         """Row of the cells' histories to which the evidence is added."""
         return BASE if self.epoch is None else Epoch(self.epoch)
+
+    @property
+    def may_have_cells(self) -> bool:
+        """True if its version has cells."""
+        return self.version in (SUM_VERSION, EPOCH_VERSION)
 
     @property
     def commit_id(self) -> CommitId:
@@ -207,12 +223,12 @@ def make_commit(
     """
     layer = grid if isinstance(grid, MapLayer) else MapLayer(geometry=grid)
     geometry = layer.geometry
-    if meta.grid != geometry.digest().hex() or meta.layers != (() if meta.marks else layer.identities):
+    if meta.grid != geometry.digest().hex() or meta.layers != (layer.identities if meta.may_have_cells else ()):
         raise BadInputError("other_geometry", "the commit's meta names another geometry than its evidence has")
     # Only evidence that adds, and that has weights.
     held = {key: evidence for key, evidence in diff.items() if len(evidence)}
-    if meta.marks and held:
-        raise BadInputError("bad_commit", "a commit has either marks or evidence; make two of it")
+    if held and not meta.may_have_cells:
+        raise BadInputError("bad_commit", "a commit has either evidence, or marks, or defines a layer; make two of it")
     for evidence in held.values():
         if evidence.is_signed:
             raise negative_evidence()
@@ -334,7 +350,7 @@ def split_bytes(data: bytes) -> tuple[CommitMeta, bytes, list[bytes]]:
     _, version, meta_bytes = HEAD.unpack_from(data)
     prefix = CELL_PREFIX.get(version)
     if prefix is None:
-        raise BadInputError("unknown_version", f"this reader knows commits of version 1 to 3, got {version}")
+        raise BadInputError("unknown_version", f"this reader knows commits of version 1 to 4, got {version}")
     _check_size(len(data), 0, meta_bytes)
     # Meta.
     text = data[HEAD.size : HEAD.size + meta_bytes]
@@ -349,6 +365,8 @@ def split_bytes(data: bytes) -> tuple[CommitMeta, bytes, list[bytes]]:
         errors = exc.errors(include_url=False, include_input=False)
         if any(set(error["loc"]) & EVICTION_FIELDS for error in errors):
             raise BadInputError("unknown_version", "this reader knows no layers that let old rows go") from None
+        if any(error["loc"][:1] == ("layer",) and error["type"] in NEWER for error in errors):
+            raise BadInputError("unknown_version", "this reader knows no layers of this kind") from None
         if any(error["loc"] == ("marks",) and error["type"] == "too_long" for error in errors):
             raise BadInputError(
                 "too_many_marks", f"a commit has at most {MARKS_MAX} marks; make several of it"
@@ -359,8 +377,8 @@ def split_bytes(data: bytes) -> tuple[CommitMeta, bytes, list[bytes]]:
     # Cells: a length that is cut off counts as too large, so that `at` passes the end.
     (count,) = struct.unpack_from("<I", data, at - 4)
     _check_size(len(data), count, meta_bytes)
-    if meta.marks and count:
-        raise DamagedDataError("bad_commit", "a commit with marks has no cells")
+    if count and not meta.may_have_cells:
+        raise DamagedDataError("bad_commit", "a commit with marks, or one that defines a layer, has no cells")
     bodies: list[bytes] = []
     for _ in range(count):
         # Layer 0 is the only one, so a prefix of version 2 is one zero and the length.
@@ -402,10 +420,12 @@ def commit_sha(text: bytes, digests: list[bytes], *, version: int = SUM_VERSION)
 
 
 def version_of_meta(text: bytes) -> int:
-    """Version of a validated commit, by the bytes of its meta: version 3 has marks, version 2 names its layers."""
-    if b"layers" not in text and b"marks" not in text and b"\\" not in text:  # nor is a name written in escapes
+    """Version of a validated commit, by the bytes of its meta: 4 defines a layer, 3 has marks, 2 names its layers."""
+    if b"layer" not in text and b"marks" not in text and b"\\" not in text:  # nor is a name written in escapes
         return SUM_VERSION
     fields = json.loads(text)
+    if fields.get("layer"):
+        return LAYER_VERSION
     if fields.get("marks"):
         return MARK_VERSION
     return EPOCH_VERSION if fields.get("layers") else SUM_VERSION

@@ -27,6 +27,10 @@ SERVERS_OWN = frozenset({OPERATOR, INITIAL})
 """Authors in whose name servers speak."""
 
 
+MAP_NAME = re.compile(r"(?P<map>[a-z0-9][a-z0-9_-]{0,31})(?:\.(?P<layer>[a-z][a-z0-9_]{0,31}))?")
+"""Name of a map, or MAP.LAYER: of one of its further layers. No map's or robot's own name has a dot."""
+
+
 class Author(NamedTuple):
     """A robot in one incarnation of its commit store."""
 
@@ -50,6 +54,27 @@ class CommitId(NamedTuple):
 def new_incarnation() -> Incarnation:
     """A random incarnation; two are equal once in 2^64."""
     return Incarnation(secrets.token_hex(8))
+
+
+def map_name(text: str) -> str:
+    """A checked name of a map or, as MAP.LAYER, of one of its layers.
+
+    Raises:
+        BadInputError: it is none.
+    """
+    if not MAP_NAME.fullmatch(text):
+        raise BadInputError(
+            "bad_name",
+            f"a map's name is 1 to 32 of a-z, 0-9, _ and -, beginning with a letter or digit, and a layer's is "
+            f"MAP.LAYER, got {text[:80]!r}",
+        )
+    return text
+
+
+def map_of_layer(name: str) -> str | None:
+    """Name of the map of a layer's name MAP.LAYER; None for the name of a map."""
+    whole, dot, _ = name.partition(".")
+    return whole if dot else None
 
 
 def robot_name(text: str) -> RobotName:

@@ -16,6 +16,7 @@ from typing import Annotated, NamedTuple
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
+from cairn_map.commits.attachment import Attachment
 from cairn_map.commits.ids import CommitId, commit_id_from_text
 from cairn_map.errors import BadInputError, first_error
 from cairn_map.evidence.grid import CELL_LIMIT, Geometry
@@ -81,6 +82,8 @@ class Mark(BaseModel):
     """Time at which it was made or changed, milliseconds since 1970, UTC."""
     by: Annotated[Line, Field(max_length=NAME_MAX)] = ""
     """Person or robot that speaks in a commit of `operator`; empty in a robot's own."""
+    attachment: Attachment | None = None
+    """Bytes that belong to it, such as a picture; they travel apart from the commit."""
 
     @property
     def low_mm(self) -> tuple[int, int, int]:
@@ -139,6 +142,7 @@ def make_mark(
     extent_m: Iterable[float] = (0.0, 0.0, 0.0),
     note: str = "",
     by: str = "",
+    attachment: Attachment | None = None,
 ) -> Mark:
     """Mark of texts as people write them and lengths in metres, rounded to millimetres.
 
@@ -158,6 +162,7 @@ def make_mark(
             note=unicodedata.normalize("NFC", note.replace("\r\n", "\n")),
             time_ms=round(time_s * 1000),
             by=unicodedata.normalize("NFC", by),
+            attachment=attachment,
         )
     except (ValidationError, ValueError, OverflowError) as exc:
         said = first_error(exc) if isinstance(exc, ValidationError) else f"the time is {time_s} s"

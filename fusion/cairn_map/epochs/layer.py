@@ -2,14 +2,17 @@
 
 A layer is named by its definition, not by a number: two servers that define the same layer can be joined. A map without
 epochs has one layer, whose digest is that of its geometry alone, as in format version 1.
+
+A map may have further layers, at other resolutions (`LayerDefinition`). Each is a log of its own, with cells, cursors
+and robots like a map's, under the name MAP.LAYER: what is said here of one layer holds in each (decision 033).
 """
 
 import hashlib
 import json
 from functools import lru_cache
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_serializer, field_validator
 
 from cairn_map.epochs.epoch import EPOCH_S_MAX, Epoch, epoch_of
 from cairn_map.errors import ConflictError
@@ -17,6 +20,8 @@ from cairn_map.evidence.grid import Geometry
 
 EVIDENCE = "evidence"
 """Name of a map's first layer."""
+LAYERS_MAX = 16
+"""Layers of a map, the first one included."""
 
 
 Hex32 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
@@ -38,6 +43,35 @@ class LayerIdentity(BaseModel, frozen=True):
         """SHA-256 (32 bytes) over the definition as JSON, with sorted keys."""
         text = json.dumps(self.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(text.encode()).digest()
+
+
+class LayerDefinition(BaseModel, frozen=True):
+    """Definition of a further layer of a map, as the commit states it that begins the layer; for ever the same."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    name: LayerName
+    kind: Literal["evidence"] = "evidence"
+    geometry: Geometry
+    epoch_s: EpochLength | None = None
+    """Length of an epoch, seconds; None: one sum for all times."""
+
+    @field_validator("name")
+    @classmethod
+    def _is_further(cls, name: str) -> str:
+        if name == EVIDENCE:
+            raise ValueError(f"{EVIDENCE} is the layer that a map begins with; take another name")
+        return name
+
+    @field_serializer("geometry")
+    def _whole(self, geometry: Geometry) -> dict[str, Any]:
+        # Whatever else is left out: the depth that a reader would take for a missing one is not always the default.
+        return geometry.model_dump(mode="json")
+
+    def __str__(self) -> str:
+        """Such as `layer fine: voxels of 0.01 m, cells of 128^3, channels colour, one sum for all times`."""
+        epochs = "one sum for all times" if self.epoch_s is None else f"epochs of {self.epoch_s} s"
+        return f"layer {self.name}: {self.geometry}, {epochs}"
 
 
 class MapLayer(BaseModel, frozen=True):

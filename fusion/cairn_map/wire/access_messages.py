@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from cairn_map.wire.messages import NameText
+from cairn_map.wire.messages import MapNameText, NameText
 from cairn_map.wire.utc_times import UtcText
 
 RoleText = Literal["admin", "operator", "robot", "reader", "enroller", "relay"]
@@ -47,7 +47,7 @@ class TokenInfo(_Model):
 
     name: str
     role: RoleText
-    map: NameText | None
+    map: MapNameText | None
     robot: NameText | None
     created_s: float
     expires_s: float | None

@@ -18,7 +18,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, FailFast, Field, TypeAdapter
 
 from cairn_map.wire.mark_messages import MarkEntry
-from cairn_map.wire.messages import Count, CursorText, IdText, LogEntry, NameText, RobotStatus
+from cairn_map.wire.messages import Count, CursorText, IdText, LogEntry, MapNameText, NameText, RobotStatus
 
 CELLS_MAX = 256
 """Cells in one event, at most; more are `many`."""
@@ -58,7 +58,7 @@ class Hello(_Model):
 
     type: Literal["hello"] = "hello"
     id: EventId
-    map: NameText
+    map: MapNameText
     cursor: CursorText
     resumed: bool
     """True if the listener's id is of this log: all changes folded since then follow."""

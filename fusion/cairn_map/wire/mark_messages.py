@@ -6,6 +6,7 @@ from typing import Annotated, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, FailFast, Field, model_validator
 
+from cairn_map.commits.attachment import ATTACHMENT_BYTES_MAX, Attachment
 from cairn_map.commits.ids import CommitId, commit_id_from_text
 from cairn_map.commits.mark import Mark, MarkKey, mark_key_from_text
 from cairn_map.errors import BadInputError
@@ -86,6 +87,8 @@ class MarkText(_Model):
     place_m: tuple[Metres, Metres, Metres]
     extent_m: tuple[Metres, Metres, Metres] = (0.0, 0.0, 0.0)
     note: str = ""
+    attachment: Attachment | None = None
+    """Bytes that belong to it, which are sent on their own once the mark is there."""
 
 
 class MarkRequest(_Model):
@@ -109,3 +112,21 @@ class MarkReceipt(_Model):
     """Commit that says it."""
     key: KeyText | None
     """The mark from here on; None: it was removed."""
+
+
+class WantedAttachments(_Model):
+    """Answer to `GET /maps/{map}/main/attachments`."""
+
+    wanted: Annotated[list[Attachment], FailFast()]
+    """Attachments that marks of the map name and that the server does not have whole, the oldest first."""
+    more: bool
+    """True if there may be more of them."""
+
+
+class AttachmentState(_Model):
+    """Answer to `PATCH /maps/{map}/main/attachments/{sha}`."""
+
+    held_bytes: Annotated[int, Field(ge=0, le=ATTACHMENT_BYTES_MAX)]
+    """Bytes that are there from this sender, from the first one on: the next part begins here."""
+    is_whole: bool
+    """True once all bytes are there and have the SHA-256."""

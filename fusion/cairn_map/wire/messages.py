@@ -34,6 +34,8 @@ CursorText = Annotated[str, Field(max_length=128)]
 FingerprintText = Annotated[str, Field(pattern=r"^[0-9a-f]{32}$")]
 ShaText = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 NameText = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,31}$")]
+MapNameText = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,31}(\.[a-z][a-z0-9_]{0,31})?$")]
+"""Name of a map, or MAP.LAYER."""
 IdText = Annotated[str, Field(max_length=96)]
 # Absent, not null or 0, where there are no epochs: programs of before refuse fields that they do not know.
 EpochLengthOrNone = Annotated[EpochLength | None, Field(exclude_if=lambda value: value is None)]
@@ -114,9 +116,9 @@ class CreateMap(_Model):
 
 
 class MapInfo(_Model):
-    """Facts of one map on a server."""
+    """Facts of one map on a server, or of one of its layers."""
 
-    name: NameText
+    name: MapNameText
     geometry: Geometry
     sensor_model: SensorModel
     cursor: CursorText
@@ -157,7 +159,7 @@ class MapSizes(_Model):
 class MapDeleted(_Model):
     """Answer to `DELETE /maps/{map}`."""
 
-    name: NameText
+    name: MapNameText
     deleted_s: Annotated[float, Field(ge=0, allow_inf_nan=False)]
     """Time of the deletion, UTC seconds since 1970."""
 

@@ -10,6 +10,7 @@ from typing import Annotated, Protocol
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from cairn_map.commits.attachment import Attachment
 from cairn_map.commits.ids import Author, CommitId, author_from_text, commit_id_from_text
 from cairn_map.commits.version_vector import AUTHORS_MAX, VersionVector, version_vector_from_json
 from cairn_map.errors import CairnError
@@ -79,6 +80,38 @@ class MapEnd(Protocol):
         ...
 
 
+class AttachmentEnd(MapEnd, Protocol):
+    """The same with the attachments of its marks."""
+
+    def has_attachments(self) -> bool:
+        """False if the place has none that it could give; True, too, where finding out would take a request."""
+        ...
+
+    def wanted_attachments(self) -> list[Attachment]:
+        """Attachments that marks in this place name and whose bytes it lacks; the first ones of many.
+
+        Raises:
+            CairnError: the place cannot be reached, or it knows no attachments.
+        """
+        ...
+
+    def attachment(self, attachment: Attachment) -> bytes | None:
+        """Bytes of an attachment, compared with its SHA-256; None if they are not here.
+
+        Raises:
+            CairnError: the place cannot be reached.
+        """
+        ...
+
+    def keep_attachment(self, attachment: Attachment, data: bytes) -> None:
+        """Keep the bytes of an attachment that is wanted; durable on return.
+
+        Raises:
+            CairnError: the place refuses it, or cannot be reached.
+        """
+        ...
+
+
 class OwnServer(Protocol):
     """The server that `cairn serve --upstream` connects to another one."""
 
@@ -86,7 +119,7 @@ class OwnServer(Protocol):
         """Names of the server's maps."""
         ...
 
-    def open(self, upstream: MapInfo) -> MapEnd:
+    def open(self, upstream: MapInfo) -> AttachmentEnd:
         """The server's map of the same name as the upstream's, created if there is none.
 
         Raises:

@@ -60,9 +60,9 @@ class Caller:
         """True if this caller may push commits of this robot."""
         return self.role is Role.ADMIN or (self.robot == robot and robot not in RESERVED_ROBOT_NAMES)
 
-    def counts_on(self, map_number: int | None) -> bool:
-        """True if the token counts on a map (None: on the server as a whole)."""
-        return self.map_number in (None, map_number)
+    def counts_on(self, row: MapRow | None) -> bool:
+        """True if the token counts on a map or layer (None: on the server as a whole); a map's does on its layers."""
+        return self.map_number is None or (row is not None and self.map_number in (row.number, row.names_number))
 
 
 ADMIN_FILE, ENROLLER_FILE, LOCAL = Caller(Role.ADMIN, name="admin"), Caller(Role.ENROLLER, name="enroller"), "local"
@@ -129,7 +129,7 @@ class TokenHolders:
         caller = self._holder(secret_hash)
         if caller is None and (gone := self._store.tokens.gone(secret_hash)) is not None:
             raise map_gone(gone)
-        if caller is None or not (row is None or caller.counts_on(row.number)):
+        if caller is None or not (row is None or caller.counts_on(row)):
             raise bad_token()
         return caller
 

@@ -3,6 +3,7 @@
     log       every chain follows from the one before, the head is the last, stored vectors name what was folded
     commits   every diff that is kept decodes, and all of a commit together have its SHA-256
     sums      totals and tiles are those of the cells
+    marks     those of the map are those of its commits that are not taken out; attachments have their SHA-256
     cells     bytes, digest, fingerprint and size agree; and where every diff is kept, the cell is their sum
 
 Sums are compared by fingerprint, which adds as evidence does, so nothing is merged.
@@ -14,9 +15,12 @@ from dataclasses import dataclass, field
 from itertools import groupby
 
 import numpy as np
+from pydantic import ValidationError
 
-from cairn_map.commits.commit import commit_sha, version_of_meta
+from cairn_map.commits.commit import CommitMeta, commit_sha, version_of_meta
 from cairn_map.commits.cursor import ENTRY_FOLD, next_chain
+from cairn_map.commits.ids import CommitId
+from cairn_map.commits.mark import Mark, MarkKey
 from cairn_map.commits.version_vector import EMPTY
 from cairn_map.epochs.cell_history import row_fingerprint
 from cairn_map.epochs.epoch import Epoch
@@ -27,12 +31,14 @@ from cairn_map.kernels.morton_kernels import UInts
 from cairn_server.folding.cells_at_rest import check_stored, decode_stored, rebuilt_cell
 from cairn_server.store.objects.cold_bytes import AwayError
 from cairn_server.store.store import Snapshot, Store
-from cairn_server.store.store_rows import CellRow, ChainedEntry, MapRow, StoredCommit
+from cairn_server.store.store_rows import CellRow, ChainedEntry, MapRow, MarkChange, StoredCommit
 from cairn_server.store.tiles import corners_of, first_and_last_key, tile_of
 
 PAGE = 500
 PENDING_BYTES_MAX = 256 << 20
 """Most bytes of the pending commits that are checked; folding checks each of them in any case."""
+MISSING_MAX = 1_000_000
+"""Most missing attachments that are counted."""
 Report = Callable[[int, int], None]
 """Callback for progress: steps done, and all steps."""
 KnownDiffs = dict[tuple[bytes, Epoch], Fingerprint]
@@ -50,6 +56,8 @@ class Finding:
     """Cell that it is about; None: no single cell."""
     sound: CellRow | None = None
     """Same cell rebuilt from the log; None where the log cannot."""
+    attachment: bytes | None = None
+    """SHA-256 of the attachment that it is about."""
     is_sum: bool = False
     """True if a sum or a vector is wrong that the store keeps besides cells and log, and can compute again."""
 
@@ -65,6 +73,9 @@ class MapCheck:
     cells: int = 0
     not_kept: int = 0
     """Count of the commits whose evidence was dropped; they cannot be checked."""
+    attachments: int = 0
+    missing_attachments: int = 0
+    """Count of the attachments that marks name and that did not come, or not whole."""
     findings: list[Finding] = field(default_factory=list)
 
 
@@ -79,7 +90,8 @@ def check_map(store: Store, row: MapRow, report: Report) -> MapCheck:
         keys = [cell.key for cell in snapshot.cells()]
         total = snapshot.totals().commits + len(keys)
     known: KnownDiffs = {}
-    for commit in _commits(store, row, checked):
+    marks: dict[CommitId, tuple[Mark, ...]] = {}
+    for commit in _commits(store, row, checked, marks):
         checked.commits += 1
         checked.findings += _of_commit(row, commit, known, checked)
         report(checked.commits, total)
@@ -88,6 +100,8 @@ def check_map(store: Store, row: MapRow, report: Report) -> MapCheck:
             checked.findings += _of_cell(snapshot, row, key, known)
         checked.cells += 1
         report(checked.commits + checked.cells, total)
+    checked.findings += _of_marks(store, row, marks)
+    checked.findings += _of_attachments(store, row, checked)
     # Of damaged cells the rows may be wrong, so that the sums cannot be judged by them.
     if not any(finding.cell for finding in checked.findings):
         with store.snapshot(row) as snapshot:
@@ -95,8 +109,13 @@ def check_map(store: Store, row: MapRow, report: Report) -> MapCheck:
     return checked
 
 
-def _commits(store: Store, row: MapRow, checked: MapCheck) -> Iterator[StoredCommit]:
-    """Every folded commit once, in the order of the log, which is checked on the way; then the pending ones."""
+def _commits(
+    store: Store, row: MapRow, checked: MapCheck, marks: dict[CommitId, tuple[Mark, ...]]
+) -> Iterator[StoredCommit]:
+    """Every folded commit once, in the order of the log, which is checked on the way; then the pending ones.
+
+    The marks that folded ones brought are put into `marks`.
+    """
     with store.snapshot(row) as snapshot:
         head = snapshot.head
         chain = snapshot.chain_at(0) or b""
@@ -116,6 +135,9 @@ def _commits(store: Store, row: MapRow, checked: MapCheck) -> Iterator[StoredCom
                 vector = vector.with_commits([entry.commit])
                 commit = store.folded(row, entry.commit)
                 if commit is not None:
+                    brought = _marks_of(commit)
+                    if brought:
+                        marks[commit.id] = brought
                     yield commit
         with store.snapshot(row) as snapshot:
             is_stated = snapshot.vector_at(seq) == vector
@@ -127,6 +149,53 @@ def _commits(store: Store, row: MapRow, checked: MapCheck) -> Iterator[StoredCom
         checked.findings.append(Finding(row.name, f"log: it ends at {seq}, the head is {head}"))
     waiting = store.pending(row, limit=PAGE, size_bytes_max=PENDING_BYTES_MAX)
     yield from (commit for commit in waiting if commit.due_from is None)
+
+
+def _marks_of(commit: StoredCommit) -> tuple[Mark, ...]:
+    """Marks that a commit brought; none of one whose meta is damaged, which its SHA-256 shows."""
+    try:
+        return CommitMeta.model_validate_json(commit.text, strict=True).marks if b'"marks"' in commit.text else ()
+    except ValidationError:
+        return ()
+
+
+def _of_marks(store: Store, row: MapRow, brought: dict[CommitId, tuple[Mark, ...]]) -> Iterator[Finding]:
+    """Marks of the map that are not those of its commits, and marks of commits that the map lacks.
+
+    A server that works meanwhile folds and takes out more than was read of the log: only what was there, and is there
+    still, is said to be lacking, and of what came since each mark is compared with its commit.
+    """
+    with store.snapshot(row) as snapshot:
+        listed = {change.key: change.record for change in _listed(snapshot)}
+        out = {named.id for named in snapshot.named(list(brought)) if named.is_retracted}
+    for commit, marks in brought.items():
+        for number, mark in enumerate(marks if commit not in out else ()):
+            if listed.pop(key := MarkKey(commit, number), None) != mark.to_json():
+                yield Finding(row.name, f"mark {key} is not in the map as its commit has it")
+    for key, record in listed.items():
+        found = None if key.commit in out else store.folded(row, key.commit)
+        own = _marks_of(found) if found is not None else ()
+        if key.number >= len(own) or own[key.number].to_json() != record:
+            yield Finding(row.name, f"mark {key} is in the map, and of no commit in it")
+
+
+def _listed(snapshot: Snapshot) -> Iterator[MarkChange]:
+    """Marks of a map, page by page."""
+    after: int | None = None
+    while page := snapshot.marks(after_seq=after, limit=PAGE):
+        # After None only those that are in the map; after an entry those, too, that were taken out since.
+        yield from (change for change in page if change.record is not None)
+        after = page[-1].seq
+
+
+def _of_attachments(store: Store, row: MapRow, checked: MapCheck) -> Iterator[Finding]:
+    """Attachments whose bytes are not those that marks name."""
+    for attachment in store.attachments.whole(row.number):
+        checked.attachments += 1
+        if hashlib.sha256(store.attachments.data(row.number, attachment.sha)).digest() != attachment.sha:
+            what = f"attachment {attachment.sha256} does not have its SHA-256"
+            yield Finding(row.name, what, attachment=attachment.sha)
+    checked.missing_attachments = len(store.attachments.wanted(row.number, robot=None, limit=MISSING_MAX))
 
 
 def _of_sums(snapshot: Snapshot, row: MapRow) -> Iterator[Finding]:

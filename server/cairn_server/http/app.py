@@ -23,6 +23,7 @@ from cairn_server.http.middleware.request_trail import RequestTrail
 from cairn_server.http.middleware.token_first import TokenFirst
 from cairn_server.http.middleware.work_turns import Lanes, WorkTurns
 from cairn_server.http.openapi import DocumentedApp
+from cairn_server.http.routes import attachment as attachment_routes
 from cairn_server.http.routes import branch as branch_routes
 from cairn_server.http.routes import cell as cell_routes
 from cairn_server.http.routes import console as console_routes
@@ -40,6 +41,7 @@ ROUTERS = (
     sync_routes.router,
     router,
     map_routes.router,
+    attachment_routes.router,
     branch_routes.router,
     cell_routes.router,
     export_routes.router,

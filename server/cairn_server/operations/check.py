@@ -4,8 +4,8 @@
     2 maps, 1204 commits, 56 cells: all sound
 
 It looks at the pages of the file, at the chain of every log, at every diff that is kept against its commit's SHA-256,
-at every cell against its digest and fingerprint, and at whether each cell is the sum of its commits. It may run while
-the server does. The exit code is 0 if all is sound and 6 if not.
+at every cell against its digest and fingerprint, at whether each cell is the sum of its commits, and at the attachments
+of marks. It may run while the server does. The exit code is 0 if all is sound and 6 if not.
 
     $ cairn serve check --data ./cairn-data --repair
     lab: cell 0,-1,2 at rest does not have its digest: rebuilt from its commits
@@ -125,13 +125,16 @@ def check_all(store: Store, complaints: Iterable[str] = (), *, source: str = "fi
     findings: list[tuple[MapRow | None, Finding]] = [(None, Finding(source, text)) for text in complaints]
     progress = PercentLine("check")
     rows = store.maps()
-    commits = cells = not_kept = 0
+    commits = cells = not_kept = attachments = missing = 0
     for row in rows:
         checked = check_map(store, row, progress.at)
         findings += [(row, finding) for finding in checked.findings]
         commits, cells, not_kept = commits + checked.commits, cells + checked.cells, not_kept + checked.not_kept
+        attachments, missing = attachments + checked.attachments, missing + checked.missing_attachments
     progress.finish()
     summary = f"{len(rows)} maps, {commits} commits, {cells} cells"
+    if attachments or missing:
+        summary += f", {attachments} attachments ({missing} did not come yet)"
     if not_kept:
         summary += f" ({not_kept} commits' evidence is not kept any more, so their cells cannot be added up)"
     return Outcome(findings, summary)
@@ -142,6 +145,10 @@ def _healed(store: SqliteStore, row: MapRow | None, finding: Finding) -> list[st
     if row is not None and finding.sound is not None and store.health.heal(row, finding.sound):
         store.audit("healed_cell", f"map {row.name}: {finding.what}: rebuilt from its commits")
         sys.stdout.write(f"{finding}: rebuilt from its commits\n")
+        return []
+    if row is not None and finding.attachment is not None:
+        store.attachments.drop(row.number, finding.attachment)
+        sys.stdout.write(f"{finding}: dropped, and wanted again\n")
         return []
     if finding.is_sum:
         sys.stdout.write(f"{finding}: computed again\n")

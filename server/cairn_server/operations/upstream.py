@@ -9,16 +9,22 @@ from contextlib import contextmanager
 from importlib.metadata import entry_points
 from typing import Protocol
 
-from cairn_map.commits.ids import CommitId
+from cairn_map.commits.attachment import Attachment
+from cairn_map.commits.ids import CommitId, map_of_layer
+from cairn_map.epochs.layer import LayerDefinition
 from cairn_map.errors import BadInputError, CairnError, ConflictError, NotFoundError
+from cairn_map.wire.mark_messages import PAGE_MAX
 from cairn_map.wire.messages import CreateMap, MapInfo
-from cairn_map.wire.relay_peer import TOO_MANY_MAPS, Held, MapEnd, OwnServer, SignedCommit
+from cairn_map.wire.relay_peer import TOO_MANY_MAPS, AttachmentEnd, Held, OwnServer, SignedCommit
 from cairn_server.access.auth import UPSTREAM
+from cairn_server.map_refusals import check_same_layer
 from cairn_server.service import Service
 from cairn_server.store.store_rows import MapRow
 from cairn_server.sync.handing_over import found_commit
 
 GROUP = "cairn.upstream"
+PART_BYTES = 1 << 20
+"""Bytes of an attachment that are kept in one transaction."""
 
 
 class Relay(Protocol):
@@ -62,7 +68,7 @@ def joined(service: Service) -> Iterator[Relay | None]:
 
 
 class OwnEnd:
-    """One map of this server, as a relay's `MapEnd`."""
+    """One map of this server, as a relay's `AttachmentEnd`."""
 
     def __init__(self, service: Service, row: MapRow) -> None:
         self._service = service
@@ -86,6 +92,38 @@ class OwnEnd:
             pushes.note_conflict(self._row, UPSTREAM, exc)
             raise
 
+    def has_attachments(self) -> bool:
+        """True if any are whole here."""
+        return bool(self._service.store.attachments.whole(self._row.number))
+
+    def wanted_attachments(self) -> list[Attachment]:
+        """Attachments that marks of the map name and that are not whole here."""
+        return self._service.sync.attachments.wanted(self._row, robot=None, limit=PAGE_MAX).wanted
+
+    def attachment(self, attachment: Attachment) -> bytes | None:
+        """Bytes of an attachment; None if they are not here."""
+        try:
+            return self._service.sync.attachments.data(self._row, attachment.sha256)
+        except NotFoundError:
+            return None
+
+    def keep_attachment(self, attachment: Attachment, data: bytes) -> None:
+        """Keep an attachment, whole."""
+        transfer, begin = self._service.sync.attachments, 0
+        # What the upstream began to send before a kill goes on from there.
+        for _ in range(2 * (len(data) // PART_BYTES + 2)):
+            state = transfer.add(
+                self._row,
+                UPSTREAM,
+                attachment.sha256,
+                total_bytes=len(data),
+                begin_bytes=begin,
+                data=data[begin : begin + PART_BYTES],
+            )
+            if state.is_whole:
+                return
+            begin = state.held_bytes
+
 
 class OwnMaps:
     """All maps of this server, as a relay's `OwnServer`."""
@@ -97,19 +135,30 @@ class OwnMaps:
         """Names of the maps."""
         return [row.name for row in self._service.store.maps()]
 
-    def open(self, upstream: MapInfo) -> MapEnd:
+    def open(self, upstream: MapInfo) -> AttachmentEnd:
         """The map of the same name as one of the upstream, created if it is not there.
 
         Raises:
-            ConflictError: kind `map_exists`; or `too_many_maps`: the upstream could name any number.
-            NotFoundError: kind `gone`: it was deleted here, and no other server's word brings it back.
+            ConflictError: kind `map_exists`; or `too_many_maps`: the upstream could name any number. Kind
+                `other_layer`: a layer of that name is here with another definition.
+            NotFoundError: kind `gone`: it was deleted here, and no other server's word brings it back. Kind `no_map`: a
+                layer, and the commit that defines it has not come yet.
         """
+        is_layer = map_of_layer(upstream.name) is not None
         try:
-            self._service.store.map(upstream.name)
+            row = self._service.store.map(upstream.name)
         except NotFoundError as exc:
             if exc.kind == "gone":
                 raise
+            if is_layer:
+                raise NotFoundError(
+                    "no_map", f"layer {upstream.name} is not here yet: it comes with a commit of its map"
+                ) from exc
             self._check_place()
+        else:
+            if is_layer:
+                _check_same(row, upstream)
+                return OwnEnd(self._service, row)
         request = CreateMap(geometry=upstream.geometry, sensor_model=upstream.sensor_model, epoch_s=upstream.epoch_s)
         _, is_new = self._service.maps.create(upstream.name, request)
         if is_new:
@@ -118,7 +167,8 @@ class OwnMaps:
 
     def _check_place(self) -> None:
         """Raises: ConflictError: kind `too_many_maps`: no more maps are made for the upstream."""
-        count, most = len(self._service.store.maps()), self._service.settings.upstream_maps_max
+        maps = [row for row in self._service.store.maps() if row.of_map is None]  # of layers a map has few
+        count, most = len(maps), self._service.settings.upstream_maps_max
         if count >= most:
             raise ConflictError(
                 TOO_MANY_MAPS,
@@ -137,6 +187,15 @@ class OwnMaps:
     def note_round(self, map_name: str | None, ill: CairnError | None) -> None:
         """Note how a round with the upstream went."""
         self._service.sync.upstream.note_round(map_name, ill)
+
+
+def _check_same(row: MapRow, upstream: MapInfo) -> None:
+    """Raises: ConflictError: kind `other_layer`: the upstream's layer of this name is another one."""
+    check_same_layer(
+        row.name,
+        row.layer,
+        LayerDefinition(name=row.name.partition(".")[2], geometry=upstream.geometry, epoch_s=upstream.epoch_s),
+    )
 
 
 _IS_AN_OWN_SERVER: type[OwnServer] = OwnMaps

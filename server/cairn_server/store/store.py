@@ -22,6 +22,7 @@ from cairn_map.wire.access_messages import AuditEntry
 from cairn_map.wire.messages import LogEntry
 from cairn_server.map_refusals import GoneMap
 from cairn_server.store.admission import OWN_WORD, Grounds, RobotKey
+from cairn_server.store.attachments.attachments import Attachments
 from cairn_server.store.replica_notes import ReplicaNotes
 from cairn_server.store.store_age import StoreAge
 from cairn_server.store.store_clock import StoreClock
@@ -408,6 +409,11 @@ class Store(Protocol):
         ...
 
     @property
+    def attachments(self) -> Attachments:
+        """Attachments of marks."""
+        ...
+
+    @property
     def leases(self) -> FoldLeases | None:
         """Claims of maps, if several processes may fold this store; None: one process has it."""
         ...
@@ -447,12 +453,9 @@ class Store(Protocol):
         ...
 
     def delete_map(self, row: MapRow, *, by: str) -> GoneMap:
-        """Take a map out of the store for good, and end its tokens; durable on return.
+        """Take a map and its layers out of the store for good, and end their tokens; durable on return.
 
-        Its rows go later (`clear_deleted`). Whatever is asked of it from here on is refused as `map_gone` says.
-
-        Raises:
-            NotFoundError: kind `gone`.
+        Rows go later (`clear_deleted`). All that is asked of it later is `map_gone`; NotFoundError `gone`: it was gone.
         """
         ...
 
@@ -464,7 +467,11 @@ class Store(Protocol):
         ...
 
     def maps(self) -> list[MapRow]:
-        """All maps, by name."""
+        """All maps and all their further layers, by name."""
+        ...
+
+    def layers(self, row: MapRow) -> list[MapRow]:
+        """Further layers of a map, by name."""
         ...
 
     def heads(self, numbers: Collection[int] | None = None) -> list[tuple[MapRow, Cursor]]:
@@ -494,7 +501,8 @@ class Store(Protocol):
 
         Raises:
             ConflictError: kind `id_taken`: the id is kept with other bytes; or `evidence_gone`: it retracts a commit
-                whose evidence is not kept any more. Pushed again, with the same bytes, that is kept again.
+                whose evidence is not kept any more. Pushed again, with the same bytes, that is kept again. Or
+                `other_layer` or `too_many_layers`: it defines one that the map cannot have.
             DeniedError: kind `not_admitted`: its author's name is bound to another key (`admission.check_commit`).
             BadInputError: kind `evidence_overflow`: its robot's share of the sums is taken; `too_many_marks`; or its
                 number is refused by `numbering.check_number`.

@@ -10,7 +10,7 @@ from cairn_map.commits.ids import Author, CommitId
 from cairn_map.commits.mark import Mark, MarkKey
 from cairn_map.commits.version_vector import VersionVector
 from cairn_map.epochs.epoch import BASE, Epoch
-from cairn_map.epochs.layer import MapLayer
+from cairn_map.epochs.layer import LayerDefinition, MapLayer
 from cairn_map.evidence.fingerprint import Fingerprint
 from cairn_map.evidence.grid import CellKey, Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
@@ -39,11 +39,18 @@ class MapRow:
     """Key by which the server recognizes the retracts that it made."""
     epoch_s: int | None = None
     """Length of an epoch, seconds; None: one sum for all times."""
+    of_map: int | None = None
+    """Number of the map whose further layer it is; None: it is a map itself."""
 
     @property
     def layer(self) -> MapLayer:
         """Definition of its evidence: the grid and the length of an epoch."""
         return MapLayer(geometry=self.geometry, epoch_s=self.epoch_s)
+
+    @property
+    def names_number(self) -> int:
+        """Number of the map that robots' names are bound on, and tokens count on: of a layer that of its map."""
+        return self.number if self.of_map is None else self.of_map
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,6 +81,8 @@ class NewCommit:
     """Epoch of all its evidence."""
     marks: tuple[Mark, ...] = ()
     """Its marks, by number; then it has no evidence."""
+    layer: LayerDefinition | None = None
+    """Layer of the map that begins with it; then it has no evidence."""
 
 
 Millimetres = tuple[int, int, int]

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 from cairn_map.commits.ids import Author, CommitId, Incarnation, RobotName, commit_id_from_text
-from cairn_map.commits.mark import MarkKey
+from cairn_map.commits.mark import Mark, MarkKey
 from cairn_map.epochs.epoch import BASE, Epoch
 from cairn_map.evidence.fingerprint import fingerprint_from_bytes
 from cairn_map.evidence.grid import CellKey
@@ -93,6 +93,11 @@ def log_entry(
             "note": note or "",
         }
     )
+
+
+def attached_columns(mark: Mark) -> tuple[bytes | None, int | None]:
+    """SHA-256 and size of a mark's attachment, as they are stored; None, None: it has none."""
+    return (None, None) if mark.attachment is None else (mark.attachment.sha, mark.attachment.size_bytes)
 
 
 def corner_conditions(mark: str) -> str:

@@ -272,7 +272,7 @@ class ClockTrust:
                 self._tokens, self._tokens_until_s = tokens, now_s + TOKENS_S
         name = registration_name(row.name, author.robot)
         return any(
-            (token.name == name or (token.robot == author.robot and token.map_number == row.number))
+            (token.name == name or (token.robot == author.robot and token.map_number in (row.number, row.names_number)))
             and token.created_age_s < before_age_s
             for token in self._tokens
         )

@@ -17,6 +17,7 @@ from cairn_map.errors import NotFoundError
 from cairn_map.files.export_request import ExportRequest
 from cairn_map.wire.mark_messages import MarkPage, MarkReceipt, MarkRequest, MarkText
 from cairn_server.access.auth import Caller
+from cairn_server.map_refusals import layer_of_map
 from cairn_server.store.history import is_proven
 from cairn_server.store.store import Snapshot, Store
 from cairn_server.store.store_rows import MapRow, MarkBox, entries_of, removed_commits
@@ -67,9 +68,11 @@ class Marking:
         """Add, change or remove a mark, as an operator says; durable on return.
 
         Raises:
-            BadInputError: kind `bad_mark`, `bad_place`, `bad_id` or `too_many_marks`.
+            BadInputError: kind `bad_mark`, `bad_place`, `bad_id`, `layer_of_map` or `too_many_marks`.
             NotFoundError: kind `no_mark`: there is none of this key, or it was taken out.
         """
+        if row.of_map is not None:
+            raise layer_of_map(row.name, "marks are the map's; mark there")
         new = None if request.mark is None else _mark_of(request.mark, row, by=by.name)
         marks: tuple[Mark, ...] = (new,) if new else ()
         targets: tuple[CommitId, ...] = ()
@@ -127,6 +130,7 @@ def _mark_of(text: MarkText, row: MapRow, *, by: str) -> Mark:
         note=text.note,
         time_s=time.time(),
         by=by,
+        attachment=text.attachment,
     )
     check_place(mark, row.geometry)
     return mark

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from cairn_map.commits.commit import CommitMeta, make_commit
 from cairn_map.commits.ids import OPERATOR, Author, CommitId, new_incarnation
 from cairn_map.commits.mark import Mark
+from cairn_map.epochs.layer import LayerDefinition
 from cairn_map.errors import BadInputError, ConflictError
 from cairn_server.store.store import Store
 from cairn_server.store.store_rows import MapRow, NewCommit
@@ -23,16 +24,22 @@ class OperatorCommits:
         """Next number, by map and author; a lower one says that the store was restored while this server ran."""
 
     def append(
-        self, row: MapRow, *, retracts: tuple[CommitId, ...] = (), note: str = "", marks: tuple[Mark, ...] = ()
+        self,
+        row: MapRow,
+        *,
+        retracts: tuple[CommitId, ...] = (),
+        note: str = "",
+        marks: tuple[Mark, ...] = (),
+        layer: LayerDefinition | None = None,
     ) -> CommitId:
-        """Keep a commit that takes others out, or brings marks, or both; durable on return.
+        """Keep a commit that takes others out, or brings marks, or both, or defines a layer; durable on return.
 
         Raises:
-            ConflictError: kind `evidence_gone`.
+            ConflictError: kind `evidence_gone`, `other_layer` or `too_many_layers`.
             BadInputError: kind `too_many_marks`.
         """
         author = Author(OPERATOR, self.operator)
-        build = _builder(row, author, retracts, note, marks)
+        build = _builder(row, author, retracts, note, marks, layer)
         key = row.number, author
         tried: list[int] = []
 
@@ -46,7 +53,7 @@ class OperatorCommits:
             commit = self._store.append_built(row, author, build_next).id
         except _LostNumberError:
             self.operator = new_incarnation()
-            return self.append(row, retracts=retracts, note=note, marks=marks)
+            return self.append(row, retracts=retracts, note=note, marks=marks, layer=layer)
         except (BadInputError, ConflictError):  # refused, so that the number stays free
             raise
         except Exception:  # it may be kept: the number counts as used
@@ -66,9 +73,14 @@ class _LostNumberError(ConflictError):
 
 
 def _builder(
-    row: MapRow, author: Author, retracts: tuple[CommitId, ...], note: str, marks: tuple[Mark, ...]
+    row: MapRow,
+    author: Author,
+    retracts: tuple[CommitId, ...],
+    note: str,
+    marks: tuple[Mark, ...],
+    layer: LayerDefinition | None,
 ) -> Callable[[int], NewCommit]:
-    has_layers = row.layer.has_epochs and not marks
+    has_layers = row.layer.has_epochs and not marks and layer is None
 
     def build(n: int) -> NewCommit:
         meta = CommitMeta(
@@ -78,6 +90,7 @@ def _builder(
             retracts=tuple(map(str, retracts)),
             note=note,
             marks=marks,
+            layer=layer,
         )
         commit = make_commit(meta, {}, row.layer)
         return NewCommit(
@@ -90,6 +103,7 @@ def _builder(
             diff={},
             tops={},
             marks=marks,
+            layer=layer,
         )
 
     return build

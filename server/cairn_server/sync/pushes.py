@@ -20,6 +20,7 @@ from cairn_map.errors import ConflictError, DeniedError, UnreachableError
 from cairn_server.access.auth import UPSTREAM, Caller, Role
 from cairn_server.access.quotas import Meter
 from cairn_server.access.rate_limits import AuditLimit
+from cairn_server.cell_room import check_geometry
 from cairn_server.live.hub import Hub
 from cairn_server.settings import Settings
 from cairn_server.store.admission import Grounds
@@ -82,7 +83,7 @@ class Pushes:
             UnreachableError: kind `quota`: more than the robot may push now; `disk_full`; or `bad_clock`.
             DeniedError: kind `not_admitted`: its author's name is bound to another key (`store.admission`).
             ConflictError: kind `id_taken`: the id is known with other bytes; or `evidence_gone`: the commits that it
-                retracts are wanted from now on.
+                retracts are wanted from now on; or `other_layer` or `too_many_layers`.
         """
         # Parsed once, decoded nowhere yet: claims and quotas refuse by the heads alone.
         commit = commit_reader(data)
@@ -92,6 +93,8 @@ class Pushes:
         signed = signatures_from_text(signatures) if signatures else ()
         speaker = self._speaker(row, caller, commit, signed, seal)
         check_claims(row, speaker, id_text, commit.meta, cells=len(commit.cells))
+        if commit.meta.layer is not None:
+            check_geometry(commit.meta.layer.geometry, self._settings.memory)
         self._check_time(row, commit.meta)
         via = caller.name if speaker is not caller and caller.role is Role.RELAY else None
 

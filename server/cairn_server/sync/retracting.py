@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable
 
 from cairn_map.commits.commit import RETRACTS_MAX, sha_without_evidence
-from cairn_map.commits.ids import OPERATOR, CommitId, commit_id_from_text
+from cairn_map.commits.ids import OPERATOR, CommitId, commit_id_from_text, map_of_layer
 from cairn_map.errors import BadInputError, NotFoundError
 from cairn_map.wire.messages import Retract, Retracted
 from cairn_server.access.auth import Caller
@@ -78,14 +78,17 @@ def targets_of(request: Retract, snapshot: Snapshot) -> list[CommitId]:
     if any(target.author.robot == OPERATOR for target in targets):
         raise BadInputError(
             "not_retractable",
-            "a retract is not retracted: push the evidence again; a mark goes by cairn map mark --remove",
+            "a retract is not retracted: push the evidence again; a mark goes by cairn map mark --remove, and a layer "
+            "stays for as long as its map",
         )
     return list(targets)
 
 
 def seal_of(row: MapRow, sha: bytes) -> str:
     """Seal of a retract, which only this map's server can write."""
-    return hmac.new(row.seal_key, sha, hashlib.sha256).hexdigest()
+    # Layers have their map's key, and a seal counts on one log alone.
+    of_layer = b"" if map_of_layer(row.name) is None else row.name.encode() + b"\0"
+    return hmac.new(row.seal_key, of_layer + sha, hashlib.sha256).hexdigest()
 
 
 def is_sealed(row: MapRow, data: bytes, seal: str | None) -> bool:

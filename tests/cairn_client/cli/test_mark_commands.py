@@ -1,14 +1,17 @@
 """Marks on the command line: added, listed, changed, removed, watched, and refused with the next step."""
 
+import hashlib
 import json
 from pathlib import Path
 
 import pytest
 from tests.fixtures.client.live_server import LiveServer
+from tests.fixtures.client.made import MAP
 from tests.fixtures.client.robots import robot_in
 from tests.fixtures.commands import cairn
 
 from cairn_client.cli.maps.watch import lines_of
+from cairn_map.commits.attachment import attachment_of
 from cairn_map.wire.live_events import MarksEvent
 from cairn_map.wire.mark_messages import MarkPage
 
@@ -66,6 +69,46 @@ def test_marks_of_robots_are_listed_and_those_that_were_changed_twice_are_named(
     assert [line.endswith("(changed twice: remove one)") for line in lines] == [True, True, False]
 
 
+def test_marks_are_listed_as_groups_of_one_kind(server: LiveServer, tmp_path: Path) -> None:
+    for name, at, kind in (("drip", "1,1,0", "leak"), ("leak", "1.2,1,0", "leak"), ("lamp", "1,1,0", "lamp")):
+        mark(server, tmp_path, "--add", name, "--at", at, "--kind", kind)
+    lines = cairn("map", "marks", server.map_url, "--group", "0.5", folder=tmp_path).splitlines()
+    assert [line.partition("  by local, ")[0] for line in lines] == [
+        "2 marks  leak  leak  at 1.10, 1.00, 0.00 m",
+        "1 marks  lamp  lamp  at 1.00, 1.00, 0.00 m",
+    ]
+    groups = json.loads(cairn("map", "marks", server.map_url, "--group", "0.1", "--json", folder=tmp_path))
+    assert [(group["name"], len(group["keys"]), group["authors"]) for group in groups] == [
+        ("drip", 1, ["local"]),
+        ("leak", 1, ["local"]),
+        ("lamp", 1, ["local"]),
+    ]
+    assert "no marks" in cairn("map", "marks", server.map_url, "--group", "1", "--kind", "door", folder=tmp_path)
+    cairn("map", "marks", server.map_url, "--group", "-1", folder=tmp_path, code=1)
+
+
+def test_a_file_is_attached_saved_and_taken_off(server: LiveServer, tmp_path: Path) -> None:
+    picture = b"\x89PNG\r\n\x1a\n" + b"p" * 70_000
+    (tmp_path / "lock.png").write_bytes(picture)
+    at = ("--at", "1.5,-2,1")
+    key = mark(server, tmp_path, "--add", "north door", *at, "--attach", "lock.png").split()[0]
+    sha = hashlib.sha256(picture).hexdigest()
+    assert f"  attachment {sha}, 70.0 kB" in cairn("map", "marks", server.map_url, folder=tmp_path)
+    said = cairn("map", "marks", server.map_url, "--save-attachments", "saved", folder=tmp_path)
+    assert f"saved saved/{sha}.png" in said.splitlines()
+    assert (tmp_path / "saved" / f"{sha}.png").read_bytes() == picture
+    # An edit of another field keeps it; one says so where it did not come to the server.
+    changed = json.loads(mark(server, tmp_path, "--edit", key, "--note", "open", "--json"))
+    (entry,) = listed(server, tmp_path).marks
+    assert entry.mark.attachment == attachment_of(picture)
+    row = server.service.store.map(MAP)
+    server.service.store.attachments.drop(row.number, bytes.fromhex(sha))
+    said = cairn("map", "marks", server.map_url, "--save-attachments", "saved", folder=tmp_path)
+    assert "did not come to the server yet" in said
+    mark(server, tmp_path, "--edit", changed["key"], "--detach")
+    assert [each.mark.attachment for each in listed(server, tmp_path).marks] == [None]
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "said"),
     [
@@ -74,6 +117,9 @@ def test_marks_of_robots_are_listed_and_those_that_were_changed_twice_are_named(
         (("--edit", "mole.0123456789abcdef.0", "--note", "x"), 3, "no mark"),
         (("--remove", "mole.0123456789abcdef.0:1"), 3, "no mark"),
         (("--remove", "mole.0123456789abcdef.0:1", "--note", "x"), 1, "a key alone"),
+        (("--add", "door", "--at", "0,0,0", "--attach", "none.jpg"), 1, "cannot read none.jpg"),
+        (("--add", "door", "--at", "0,0,0", "--detach"), 1, "--edit"),
+        (("--remove", "mole.0123456789abcdef.0:1", "--attach", "/dev/null"), 1, "one byte or more"),
         (("--remove", "door"), 1, "robot.incarnation.n:number"),
         (("--add", "x" * 65, "--at", "0,0,0"), 1, "name"),
         (("--add", "door", "--at", "0,0,1e9"), 1, "within"),

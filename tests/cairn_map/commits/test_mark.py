@@ -12,6 +12,7 @@ from tests.fixtures.map.made import MIDDLE, ROBOT, SMALL, made_commit, random_ev
 from tests.fixtures.map.marks import mark, mark_commit
 from tests.naive import wire as naive_wire
 
+from cairn_map.commits.attachment import ATTACHMENT_BYTES_MAX, attachment_of
 from cairn_map.commits.commit import (
     EPOCH_VERSION,
     MARK_VERSION,
@@ -52,6 +53,7 @@ marks = st.builds(
     note=texts,
     time_ms=st.integers(-(10**14), 10**14),
     by=texts.filter(str.strip),
+    attachment=st.none() | st.builds(attachment_of, st.binary(min_size=1, max_size=20)),
 )
 
 
@@ -148,6 +150,13 @@ def test_a_commit_with_marks_is_of_any_map_of_its_grid() -> None:
         (with_mark(place_mm=[0, 0, 1 << 80]), "bad_commit"),
         (with_mark(extent_mm=[0, -1, 0]), "bad_commit"),
         (with_mark(time_ms=10**14 + 1), "bad_commit"),
+        (with_mark(attachment={"sha256": "0" * 64, "size_bytes": 0}), "bad_commit"),
+        (with_mark(attachment={"sha256": "0" * 64, "size_bytes": ATTACHMENT_BYTES_MAX + 1}), "bad_commit"),
+        (with_mark(attachment={"sha256": "0" * 64, "size_bytes": 1.5}), "bad_commit"),
+        (with_mark(attachment={"sha256": "F" * 64, "size_bytes": 1}), "bad_commit"),
+        (with_mark(attachment={"sha256": "../../etc", "size_bytes": 1}), "bad_commit"),
+        (with_mark(attachment={"sha256": "0" * 64, "size_bytes": 1, "name": "x.html"}), "bad_commit"),
+        (with_mark(attachment=[]), "bad_commit"),
         (with_mark(time_ms=True), "bad_commit"),
         (with_mark(value=1), "bad_commit"),
     ],

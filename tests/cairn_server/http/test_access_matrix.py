@@ -49,6 +49,7 @@ OBJECTS = {
     "token": "a token, none",
     "cell": "one that holds evidence",
     "voxel": "one of that cell",
+    "sha": "none",
     "file": "none",
 }
 """Objects that the routes' paths name, and which of each are asked for."""

@@ -1,13 +1,16 @@
 """`cairn serve check`: every kind of damage is found and named; what the log still tells is repaired."""
 
+import hashlib
 from collections.abc import Callable
 from pathlib import Path
 
 import apsw
 import pytest
+from tests.fixtures.map.marks import attached, mark, mark_commit
 from tests.fixtures.server.live import Live
 from tests.fixtures.server.pushes import WREN, pushed, read, sum_of
 
+from cairn_map.commits.ids import Author, Incarnation
 from cairn_map.errors import ConflictError, DamagedDataError
 from cairn_server.operations.serve import main
 from cairn_server.store.sqlite.store import FILE_NAME, SqliteStore
@@ -16,6 +19,7 @@ COMMITS = [pushed(n, 0, scans=99) for n in range(3)] + [pushed(0, 1, WREN)]
 Check = Callable[..., tuple[int, str]]
 RETRACT = pushed(3, 0, cells={}, retracts=[COMMITS[0]])
 NAMES = ("map0", "map1")
+WREN_AGAIN = Author(WREN.robot, Incarnation("00000000000000cc"))
 
 
 @pytest.fixture(scope="module")
@@ -120,6 +124,51 @@ def test_a_sum_that_is_wrong_is_found_and_computed_again(
     assert (code, "computed again" in said) == (0, True)
     assert check()[0] == 0
     assert cells_of(folder, "map0") == sum_of([*COMMITS, RETRACT])
+
+
+@pytest.mark.parametrize(
+    ("statement", "complaint"),
+    [
+        (
+            "UPDATE mark SET record = replace(record, 'lamp', 'lift') WHERE n = 0 AND record IS NOT NULL",
+            "mark {key}:0 is not in the map as",
+        ),
+        ("UPDATE mark SET record = NULL WHERE n = 1", "mark {key}:1 is not in the map as"),
+        ("DELETE FROM mark WHERE n = 1", "mark {key}:1 is not in the map as"),
+        ("UPDATE mark SET n = 7 WHERE n = 1", "mark {key}:7 is in the map, and of no commit"),
+        ("INSERT INTO retracted VALUES (1, '{key}')", "mark {key}:0 is in the map, and of no commit"),
+    ],
+)
+def test_marks_that_are_not_those_of_their_commits_are_found(
+    check: Check, folder: Path, statement: str, complaint: str
+) -> None:
+    commit = mark_commit(0, mark(), mark("door"), author=WREN_AGAIN)
+    gone = mark_commit(1, mark("gone"), author=WREN_AGAIN)
+    with Live(folder) as live:
+        row = live.service.store.map("map0")
+        for each in (commit, gone, mark_commit(2, retracts=(f"{WREN_AGAIN}.1",), author=WREN_AGAIN)):
+            live.push(row, each).raise_for_status()
+        live.folded(row)
+    assert check()[0] == 0
+    damage(folder, statement.replace("{key}", str(commit.id)))
+    code, said = check()
+    assert (code, complaint.replace("{key}", str(commit.id)) in said) == (6, True), said
+
+
+def test_an_attachment_that_is_damaged_is_found_dropped_and_wanted_again(check: Check, folder: Path) -> None:
+    with Live(folder) as live:
+        row = live.service.store.map("map0")
+        live.push(row, mark_commit(0, attached(b"picture"), attached(b"later"), author=WREN_AGAIN)).raise_for_status()
+        sha = hashlib.sha256(b"picture").hexdigest()
+        path = f"/maps/map0/main/attachments/{sha}"
+        live.http.patch(path, params={"total": 7, "offset": 0}, content=b"picture").raise_for_status()
+        live.folded(row)
+    assert check() == (0, "2 maps, 11 commits, 6 cells, 1 attachments (1 did not come yet): all sound\n")
+    damage(folder, "UPDATE attachment_part SET body = CAST('pictures' AS BLOB)")
+    code, said = check()
+    assert (code, said) == (6, f"map0: attachment {sha} does not have its SHA-256\n")
+    assert check("--repair")[0] == 0
+    assert check() == (0, "2 maps, 11 commits, 6 cells, 0 attachments (2 did not come yet): all sound\n")
 
 
 def test_a_cell_that_lacks_a_commit_is_found_though_its_bytes_are_sound(check: Check, folder: Path) -> None:

@@ -10,6 +10,7 @@ from tests.fixtures.server.access import ADMIN, ENROLLER, bearer, robot_token
 from tests.fixtures.server.access_contract import AccessContract
 from tests.fixtures.server.admission_contract import AdmissionContract
 from tests.fixtures.server.answers import kind_of
+from tests.fixtures.server.attachment_contract import AttachmentContract
 from tests.fixtures.server.branch_contract import BranchContract
 from tests.fixtures.server.commit_contract import CommitContract
 from tests.fixtures.server.crowd_contract import CrowdContract
@@ -17,6 +18,7 @@ from tests.fixtures.server.deletion_contract import DeletionContract
 from tests.fixtures.server.epoch_contract import EpochContract
 from tests.fixtures.server.evidence_contract import EvidenceContract
 from tests.fixtures.server.fetching import fetch
+from tests.fixtures.server.layer_contract import LayerContract
 from tests.fixtures.server.live import Live
 from tests.fixtures.server.mark_contract import MarkContract
 from tests.fixtures.server.pushes import MOLE, WREN, pushed, read, sum_of
@@ -53,6 +55,8 @@ class TestMemoryStore(
     EvidenceContract,
     EpochContract,
     MarkContract,
+    LayerContract,
+    AttachmentContract,
     BranchContract,
     AccessContract,
     AdmissionContract,

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import pytest
 from tests.fixtures.map.made import SMALL
+from tests.fixtures.map.marks import attached, mark, mark_commit
 from tests.fixtures.server.commit_contract import bodies, folded_map, new_map
 from tests.fixtures.server.crowd_contract import all_at_once
 from tests.fixtures.server.deadline import until
@@ -23,7 +24,7 @@ from cairn_server.folding.cell_cache import CellCache
 from cairn_server.folding.folding import fold_pending
 from cairn_server.store.postgres import schema
 from cairn_server.store.postgres.connections import connect
-from cairn_server.store.postgres.schema import EPOCHS_OLDEST, STEPS, Step
+from cairn_server.store.postgres.schema import ATTACHMENTS_OLDEST, EPOCHS_OLDEST, MARKS_OLDEST, STEPS, Step
 from cairn_server.store.postgres.store import PgStore
 from cairn_server.store.replica_notes import NotedServer
 
@@ -99,7 +100,7 @@ def test_a_store_of_the_first_step_takes_those_that_it_lacks(
 
 WITHOUT_EPOCHS = """
 ALTER TABLE audit DROP COLUMN client;
-DROP TABLE mark, gone_map, gone_token;
+DROP TABLE attachment, attachment_part, mark, gone_map, gone_token;
 ALTER TABLE author DROP COLUMN kept_bytes;
 ALTER TABLE author DROP COLUMN marks;
 ALTER TABLE age DROP COLUMN clock;
@@ -156,6 +157,21 @@ def test_a_map_with_epochs_bars_programs_that_do_not_know_them_those_at_work_fir
     store.replicas.servers.remove("b" * 16)
     map_with_epochs(store)
     assert postgres_database.execute("SELECT oldest FROM cairn_schema") == [(EPOCHS_OLDEST,)]
+
+
+def test_an_attachment_bars_programs_that_read_no_mark_with_one(store: PgStore, postgres_database: Database) -> None:
+    row = new_map(store)
+    store.append(row, new_of(mark_commit(0, mark())))
+    assert postgres_database.execute("SELECT oldest FROM cairn_schema") == [(MARKS_OLDEST,)]
+    sign = NotedServer(id="a" * 16, answers=True, folds=True, version="1.0", folded_s=None)
+    store.replicas.servers.put(sign, wall_s=0.0)
+    postgres_database.execute(f"UPDATE server SET step = {MARKS_OLDEST}")
+    with pytest.raises(ConflictError, match="attachments of marks") as refused:
+        store.append(row, new_of(mark_commit(1, attached(b"picture"))))
+    assert refused.value.kind == "older_servers"
+    store.replicas.servers.remove(sign.id)
+    store.append(row, new_of(mark_commit(1, attached(b"picture"))))
+    assert postgres_database.execute("SELECT oldest FROM cairn_schema") == [(ATTACHMENTS_OLDEST,)]
 
 
 def test_a_step_that_fails_leaves_the_store_as_it_was(

@@ -15,12 +15,14 @@ from hypothesis import strategies as st
 from tests.fixtures.map.made import SMALL
 from tests.fixtures.server.access_contract import AccessContract
 from tests.fixtures.server.admission_contract import AdmissionContract
+from tests.fixtures.server.attachment_contract import AttachmentContract
 from tests.fixtures.server.branch_contract import BranchContract, branch, token
 from tests.fixtures.server.commit_contract import CommitContract
 from tests.fixtures.server.crowd_contract import CrowdContract
 from tests.fixtures.server.deletion_contract import DeletionContract
 from tests.fixtures.server.epoch_contract import EpochContract
 from tests.fixtures.server.evidence_contract import EvidenceContract
+from tests.fixtures.server.layer_contract import LayerContract
 from tests.fixtures.server.mark_contract import MarkContract
 from tests.fixtures.server.pushes import MOLE, WREN, pushed
 from tests.fixtures.server.shares_contract import SharesContract, author_of
@@ -73,6 +75,8 @@ class TestSqliteStore(
     EvidenceContract,
     EpochContract,
     MarkContract,
+    LayerContract,
+    AttachmentContract,
     BranchContract,
     AccessContract,
     AdmissionContract,

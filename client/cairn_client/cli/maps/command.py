@@ -14,6 +14,7 @@
     $ cairn map hotspots http://127.0.0.1:8750/maps/lab --over 40
     $ cairn map marks http://127.0.0.1:8750/maps/lab
     $ cairn map mark http://127.0.0.1:8750/maps/lab --add "north door" --at 1.5,-2,1 --kind door
+    $ cairn map layer add http://127.0.0.1:8750/maps/lab fine --voxel 0.01
     $ cairn map branches http://127.0.0.1:8750/maps/lab
     $ cairn map retract http://127.0.0.1:8750/maps/lab --robot mole --pushed-after 14:05 --dry-run
     $ cairn map robots list http://127.0.0.1:8750/maps/lab
@@ -33,7 +34,7 @@ import time
 from pathlib import Path
 
 from cairn_calib.rig.rig import load_rig
-from cairn_client.cli import hot_spots, marks, publish
+from cairn_client.cli import hot_spots, layers, marks, publish
 from cairn_client.cli.arguments import (
     Subparsers,
     add_map_parser,
@@ -82,6 +83,7 @@ def main(argv: list[str]) -> int:
         hot_spots.add_parser,
         marks.add_list_parser,
         marks.add_parser,
+        layers.add_parser,
         publish.add_parser,
         query.add_parser,
         render.add_parser,

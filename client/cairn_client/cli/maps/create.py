@@ -10,7 +10,17 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from cairn_client.cli.arguments import Subparsers, add_map_parser, api_of, say, shown_length
+from cairn_client.cli.arguments import (
+    EPOCH_HELP,
+    NO_EPOCHS,
+    Subparsers,
+    add_map_parser,
+    api_of,
+    channels_from_text,
+    epoch_s_from_text,
+    say,
+    shown_length,
+)
 from cairn_client.cli.maps.map_export import fetch_map
 from cairn_client.http.api import MapApi
 from cairn_client.http.origin_tokens import NO_TOKENS, OriginTokens
@@ -18,9 +28,9 @@ from cairn_map.codec.cell_code import DecodedCell, cell_digest
 from cairn_map.codec.history_code import DecodedHistory
 from cairn_map.commits.commit import Commit, CommitMeta, make_commit
 from cairn_map.commits.ids import INITIAL, Author, CommitId, Incarnation
-from cairn_map.epochs.epoch import EPOCH_S_MAX, STANDARD_EPOCH_S
+from cairn_map.epochs.epoch import STANDARD_EPOCH_S
 from cairn_map.errors import BadInputError
-from cairn_map.evidence.channels import COLOUR, INTENSITY, STANDARD_CHANNELS, TEMPERATURE, Channel, ChannelKind
+from cairn_map.evidence.channels import STANDARD_CHANNELS, Channel
 from cairn_map.evidence.grid import Geometry, geometry_for
 from cairn_map.files.cell_folder import FolderHead, read_cells, read_head
 from cairn_map.wire.messages import CreateMap, MapInfo
@@ -39,16 +49,6 @@ FILE_KINDS = {
 }
 """Kinds of files that one may take for a map, by their suffix."""
 VOXEL_M = 0.04
-NO_EPOCHS = "none"
-EPOCH_HELP = (
-    "seconds of capture whose evidence is one sum. Sums of different epochs are kept apart, and newer ones outweigh "
-    "older: what came or went shows in the next epoch, and the map as it was, and what changed since, can be asked "
-    "for. Each epoch in which a cell is seen costs about the bytes of one pass (`cairn map info` shows them); shorter "
-    f"epochs notice sooner. {STANDARD_EPOCH_S} suits people, doors and goods. `{NO_EPOCHS}`: one sum for all times, "
-    "with the fewest bytes, for scenes that stand still, since a wall seen 200 times and then gone stays for 200 "
-    "scans. Fixed for the map's life"
-)
-CHANNELS = {"colour": COLOUR, "intensity": INTENSITY, "temperature": TEMPERATURE}
 
 
 def add_parser(commands: Subparsers) -> None:
@@ -68,7 +68,7 @@ def _create(args: argparse.Namespace) -> int:
     api, name = api_of(args.map, tokens)
     if args.source is not None:
         # A grid that is asked for as well has to be the source's: evidence cannot be moved to another one.
-        asked = _Asked(args.voxel, None if args.channels is None else _channels(args.channels), args.epoch)
+        asked = _Asked(args.voxel, None if args.channels is None else channels_from_text(args.channels), args.epoch)
         with api:
             info, count, added = push_prior_data(
                 api, name, args.source, tokens=tokens, check=asked.check, epoch_s=asked.epoch_s
@@ -79,7 +79,7 @@ def _create(args: argparse.Namespace) -> int:
             say(f"{count - added} of them were pushed before, and are not added again (nor if they were retracted)")
         return 0
     with api:
-        made = api.create_map(name, CreateMap(geometry=_geometry(args), epoch_s=_epoch_s(args.epoch)))
+        made = api.create_map(name, CreateMap(geometry=_geometry(args), epoch_s=epoch_s_from_text(args.epoch)))
     say_map(made)
     return 0
 
@@ -210,7 +210,7 @@ class _Asked:
 
     def epoch_s(self, source_s: int | None) -> int | None:
         """Length of an epoch, seconds: that which was asked for, else the source's."""
-        return _epoch_s(self.epoch, otherwise=source_s)
+        return epoch_s_from_text(self.epoch, otherwise=source_s)
 
     def check(self, found: Geometry) -> None:
         """Refuse another grid than was asked for.
@@ -228,41 +228,5 @@ class _Asked:
 
 
 def _geometry(args: argparse.Namespace) -> Geometry:
-    channels = STANDARD_CHANNELS if args.channels is None else _channels(args.channels)
+    channels = STANDARD_CHANNELS if args.channels is None else channels_from_text(args.channels)
     return geometry_for(voxel_edge_m=VOXEL_M if args.voxel is None else args.voxel, channels=channels)
-
-
-def _epoch_s(text: str | None, *, otherwise: int | None = STANDARD_EPOCH_S) -> int | None:
-    """Length of an epoch, seconds, or None for a map without.
-
-    Raises:
-        BadInputError: kind `bad_epoch`.
-    """
-    if text is None:
-        return otherwise
-    if text == NO_EPOCHS:
-        return None
-    if not text.isascii() or not text.isdigit() or not 1 <= int(text) <= EPOCH_S_MAX:
-        raise BadInputError(
-            "bad_epoch", f"--epoch takes whole seconds from 1 to {EPOCH_S_MAX}, or `{NO_EPOCHS}`; got {text!r}"
-        )
-    return int(text)
-
-
-def _channels(text: str) -> tuple[Channel, ...]:
-    return tuple(map(_channel, text.split(","))) if text else ()
-
-
-def _channel(text: str) -> Channel:
-    """`colour`, `intensity`, `temperature`, or a scalar `name:unit:step`."""
-    if text in CHANNELS:
-        return CHANNELS[text]
-    name, *rest = text.split(":")
-    try:
-        unit, step = rest
-        return Channel(kind=ChannelKind.SCALAR, name=name, unit=unit, step=float(step))
-    except ValueError as exc:
-        raise BadInputError(
-            "bad_channel",
-            f"a channel is {', '.join(CHANNELS)}, or a scalar NAME:UNIT:STEP such as dose:uSv/h:0.01; got {text!r}",
-        ) from exc

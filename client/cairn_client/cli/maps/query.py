@@ -18,6 +18,8 @@ and --at with `hottest`; else the server itself finds the hottest. All lengths a
 temperatures degrees Celsius here and kelvin in JSON; unknown values are `-`, in JSON null. Of a map with epochs, points
 have the time at which they were seen last, too, and readings the count of their samples and the time of the newest: the
 beginning of its epoch, UTC.
+Of a map with layers (`cairn map layer`) each point is read in the finest layer that knows it, which is named; all other
+questions are asked of one layer: of the map's URL its first one, of MAP.LAYER that one.
 --json prints JSON for programs; `slice` and `height` then give all pixels, rows along y and columns along x.
 """
 
@@ -34,9 +36,12 @@ import numpy.typing as npt
 
 from cairn_client.cli.arguments import Subparsers, add_at, add_token, api_of, say, seconds_of
 from cairn_client.cli.robot_arguments import box, place
-from cairn_client.folders.map_folder import open_map, open_part
+from cairn_client.folders.map_folder import layers_part, open_map, open_part
 from cairn_client.folders.needed_cells import Needs, along_ray, near_points
+from cairn_client.http.map_url import split_map_url
 from cairn_map.arrays import Floats
+from cairn_map.commits.ids import map_of_layer
+from cairn_map.epochs.layer import EVIDENCE
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.voxels import Reading
@@ -78,6 +83,7 @@ def add_parser(commands: Subparsers) -> None:
 
     points = question("points", "state, probability and readings at points", _points, _at_points)
     points.add_argument("points", nargs="+", type=place, metavar="X,Y,Z", help="metres, map frame")
+    points.add_argument("--layer", metavar="NAME", help="only this layer of the map (of each point the finest known)")
     ray = question("ray", "the first occupied voxel along a ray", _ray, _on_ray)
     ray.add_argument("origin", type=place, metavar="X,Y,Z", help="metres, map frame")
     ray.add_argument("direction", type=place, metavar="DX,DY,DZ", help="direction, of any length")
@@ -103,6 +109,10 @@ def _run(args: argparse.Namespace) -> int:
     is_server = "://" in args.map
     if is_server and answer is _hottest and args.at is None:
         found, lines = _hottest_of_server(args)
+    elif is_server and answer is _points and map_of_layer(split_map_url(args.map)[1]) is None:
+        found, lines = _points_of_layers(args)
+    elif answer is _points and args.layer is not None:
+        raise BadInputError("bad_option", f"--layer names a layer of a server's map, and {args.map} is none")
     else:
         found, lines = answer(_opened(args) if is_server else open_map(args.map, at_s=seconds_of(args.at)), args)
     for line in [json.dumps(found)] if args.json else lines:
@@ -158,6 +168,31 @@ def _points(snapshot: MapSnapshot, args: argparse.Namespace) -> tuple[Any, list[
         values = {name: _value(reading, n) for name, reading in readings.items()}
         sure = {"probability": p, "hits": counts[n][0], "misses": counts[n][1]}
         found.append({"point_m": [x, y, z], "state": state, **sure, **times, "readings": values})
+    return found, lines
+
+
+def _points_of_layers(args: argparse.Namespace) -> tuple[Any, list[str]]:
+    """`_points` of a server's map, of each point in the finest layer that knows it, or in the one asked for."""
+    token, at_s = args.token.of(args.map), seconds_of(args.at)
+    layers = layers_part(args.map, _at_points(args), token=token, at_s=at_s)
+    if args.layer is not None:
+        return _points(layers[args.layer], args)
+    if len(layers.names) == 1:
+        return _points(layers[EVIDENCE], args)
+    # What no layer knows is said of the one that the map began with.
+    of_layer: dict[str, list[int]] = {name: [] for name in layers.names}
+    for n, name in enumerate(layers.names_at(args.points)):
+        of_layer[name or EVIDENCE].append(n)
+    found: list[Any] = [None] * len(args.points)
+    lines: list[str] = []
+    for name, places in of_layer.items():
+        if not places:
+            continue
+        asked = argparse.Namespace(**vars(args) | {"points": [args.points[n] for n in places]})
+        answers, said = _points(layers[name], asked)
+        for n, answer in zip(places, answers, strict=True):
+            found[n] = {"layer": name, **answer}
+        lines += [f"layer {name}, voxels of {layers[name].geometry.voxel_edge_m:g} m:", *said]
     return found, lines
 
 

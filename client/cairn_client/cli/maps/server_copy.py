@@ -1,9 +1,9 @@
 """`cairn map copy`: a map of one server on another one, with all its commits, such as from SQLite to PostgreSQL.
 
-The map is made at the destination, and each commit goes there as it was pushed, with its signatures. Nothing stops
-meanwhile: what comes to the source later goes, too, with --follow until the command is stopped. Repeated after any
-end it goes on where it was. With an admin's token at the destination all commits go: unsigned ones, prior data and
-operators' retracts as well, which a relay's token cannot hand over for others.
+The map is made at the destination, and each commit goes there as it was pushed, with its signatures; attachments of
+marks follow. Nothing stops meanwhile: what comes to the source later goes, too, with --follow until the command is
+stopped. Repeated after any end it goes on where it was. With an admin's token at the destination all commits go:
+unsigned ones, prior data and operators' retracts as well, which a relay's token cannot hand over for others.
 """
 
 import argparse
@@ -17,13 +17,14 @@ from cairn_client.cli.maps.map_sides import Difference, MapSide, difference, sid
 from cairn_client.http.backoff import Backoff
 from cairn_client.http.map_url import split_map_url
 from cairn_client.http.origin_tokens import OriginTokens
+from cairn_client.relay.carried_attachments import give_attachments
 from cairn_client.relay.link import RelayApi, ServerEnd, hold_between
 from cairn_client.relay.round import RelayReport, RelaySide, Undelivered, copy_round, log_report
 from cairn_map.commits.ids import CommitId
 from cairn_map.errors import BadInputError, CairnError, NotFoundError, UnreachableError
 from cairn_map.progress import LOG_EVERY_S, TERMINAL_EVERY_S, StatusLine
 from cairn_map.wire.messages import CreateMap
-from cairn_map.wire.relay_peer import Held, MapEnd, SignedCommit
+from cairn_map.wire.relay_peer import AttachmentEnd, Held, SignedCommit
 
 COMPLETE, LACKING = 0, 1
 EVERY_S = 5.0
@@ -79,7 +80,7 @@ def _make_map(source: RelayApi, target: RelayApi, name: str) -> None:
 class _Source:
     """The map that is copied: its commits are counted as they come."""
 
-    end: MapEnd
+    end: AttachmentEnd
     commits: int = 0
     size_bytes: int = 0
     begun_s: float = field(default_factory=time.monotonic)
@@ -119,7 +120,7 @@ class _Source:
 class _Target:
     """The copy."""
 
-    end: MapEnd
+    end: AttachmentEnd
 
     def held(self) -> Held:
         return self.end.held()
@@ -203,6 +204,8 @@ class _Copy:
                 total.has_more = True
             elif moved:
                 self._backoff.reset()
+        while give_attachments(self.source.end, self.target.end):
+            pass
         return total
 
     def _compared(self) -> tuple[Difference, tuple[MapSide, MapSide]]:

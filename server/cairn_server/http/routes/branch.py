@@ -73,8 +73,11 @@ def list_branches(service: Operations, row: Map, times: Times) -> list[BranchInf
 
 @router.delete("/maps/{name}/branches/{branch}", status_code=204)
 def deregister(branch: str, service: Operations, row: Map, caller: Annotated[Caller, Depends(own_branch)]) -> None:
-    """Deregister a robot; its evidence stays."""
-    service.maps.deregister(row, branch)
+    """Deregister a robot, by an admin from the map and its layers; its evidence stays."""
+    if caller.role is Role.ADMIN:
+        service.maps.expel(row, branch)
+    else:
+        service.maps.deregister(row, branch)
     service.store.audit_log.add(caller.name, "deregister", f"map {row.name}: {branch}", client=caller.address)
 
 

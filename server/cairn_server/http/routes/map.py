@@ -1,4 +1,4 @@
-"""Routes of maps, their log and their marks."""
+"""Routes of maps, their layers, their log and their marks."""
 
 from typing import Annotated
 
@@ -6,6 +6,7 @@ from fastapi import APIRouter, Depends, Query, Response
 
 from cairn_map.commits.commit import EPOCH_VERSION
 from cairn_map.errors import BadInputError
+from cairn_map.wire.layer_messages import LAYER_FORMAT, AddLayer, LayerAdded, LayerInfo
 from cairn_map.wire.live_events import NAMES_MAX
 from cairn_map.wire.mark_messages import PAGE_MAX, MarkPage, MarkReceipt, MarkRequest
 from cairn_map.wire.messages import CreateMap, LogEntry, MapDeleted, MapInfo, MapSizes, Retract, Retracted
@@ -23,8 +24,10 @@ router = APIRouter()
 def list_maps(
     service: Operations, caller: Annotated[Caller, Depends(reader_somewhere)], known: Format
 ) -> list[MapInfo]:
-    """The maps that the token counts on."""
-    rows = [row for row in service.store.maps() if caller.counts_on(row.number)]
+    """The maps that the token counts on, and their layers for clients that know of such."""
+    rows = [row for row in service.store.maps() if caller.counts_on(row)]
+    if known < LAYER_FORMAT:  # such clients refuse the whole list for the name of a layer
+        rows = [row for row in rows if row.of_map is None]
     return [_known_facts(service.maps.info(row), known) for row in rows]
 
 
@@ -91,6 +94,34 @@ def sizes(service: Operations, row: Map) -> MapSizes:
 def _known_facts(info: MapInfo, known: int) -> MapInfo:
     """Facts of a map without those that the client's version of the format does not have."""
     return info if known >= EPOCH_VERSION else info.model_copy(update={"epoch_s": None, "history_bytes": 0})
+
+
+@router.get("/maps/{name}/layers", dependencies=READERS)
+def list_layers(service: Operations, row: Map) -> list[LayerInfo]:
+    """The layers of a map: the one that it began with, then the others by name."""
+    return service.sync.layers.list(row)
+
+
+@router.post(
+    "/maps/{name}/layers",
+    status_code=201,
+    responses=also(200, LayerAdded) | problems(409),
+    openapi_extra=json_body(
+        AddLayer, example={"name": "fine", "geometry": {"voxel_edge_um": 10_000, "depth": 7}, "epoch_s": 120}
+    ),
+)
+def add_layer(
+    service: Operations,
+    row: Map,
+    caller: Annotated[Caller, Depends(allowed(Role.OPERATOR))],
+    body: Annotated[AddLayer, json_of(AddLayer)],
+    response: Response,
+) -> LayerAdded:
+    """Add a layer to a map, at a resolution of its own; 200 if an equal one is there."""
+    service.acts.take(caller.name, is_admin=caller.role is Role.ADMIN)
+    added = service.sync.layers.add(row, body, by=caller)
+    response.status_code = 201 if added.commit is not None else 200
+    return added
 
 
 @router.post(

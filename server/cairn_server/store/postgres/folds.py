@@ -79,7 +79,7 @@ FROM e JOIN commits AS c ON c.map = %(map)s AND c.number = e.number
     JOIN diff AS d ON d.map = c.map AND d.commit_number = c.number"""
 """SQL that writes a fold's log entries, what they touch, and which commits and marks come with them."""
 TAKE_MARKS_OUT = """
-    UPDATE mark SET changed_seq = e.seq, record = NULL
+    UPDATE mark SET changed_seq = e.seq, record = NULL, attached_sha = NULL
     FROM unnest(%(seqs)s::bigint[], %(kinds)s::bytea[], %(numbers)s::bigint[]) AS e (seq, kind, number)
     WHERE mark.map = %(map)s AND mark.commit_number = e.number AND e.kind <> %(fold)s AND record IS NOT NULL
     RETURNING mark.commit_number"""

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 from cairn_map.commits.cursor import Cursor
-from cairn_map.commits.ids import Author, CommitId, Incarnation, RobotName
+from cairn_map.commits.ids import Author, CommitId, Incarnation, RobotName, map_of_layer
 from cairn_map.evidence.grid import CellKey, Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.store.history import KnownVectors
@@ -90,6 +90,10 @@ class PgReads:
     def maps(self) -> list[MapRow]:
         """All maps, by name."""
         return self.map_rows("ORDER BY name", ())
+
+    def layers(self, row: MapRow) -> list[MapRow]:
+        """Further layers of a map, by name."""
+        return self.map_rows("WHERE starts_with(name, %s) ORDER BY name", (f"{row.name}.",))
 
     def heads(self, numbers: Collection[int] | None = None) -> list[tuple[MapRow, Cursor]]:
         """All maps, or those of these numbers that there are, with their present states."""
@@ -177,8 +181,12 @@ class PgReads:
         # In a store that was restored the number may be another map's.
         unknown = [number for number, key in found if number not in self._maps or self._maps[number].seal_key != key]
         if unknown:
-            query = "SELECT map, name, geometry, sensor_model, seal_key, epoch_s FROM map WHERE map = ANY(%s)"
-            for number, name, geometry, sensor_model, seal_key, epoch_s in rows(connection, query, (unknown,)):
+            query = (
+                "SELECT map, name, geometry, sensor_model, seal_key, epoch_s, CASE WHEN position('.' IN name) > 0 THEN"
+                " (SELECT map FROM map AS whole WHERE whole.name = split_part(map.name, '.', 1)) END"
+                " FROM map WHERE map = ANY(%s)"
+            )
+            for number, name, geometry, sensor_model, seal_key, epoch_s, of_map in rows(connection, query, (unknown,)):
                 self._maps[number] = MapRow(
                     number=number,
                     name=name,
@@ -186,8 +194,14 @@ class PgReads:
                     sensor_model=SensorModel.model_validate_json(sensor_model),
                     seal_key=seal_key,
                     epoch_s=epoch_s,
+                    of_map=of_map,
                 )
-        return [self._maps[number] for number, _ in found]
+        rows_found = [self._maps[number] for number, _ in found]
+        # The map of a layer that came out of an archive may follow it.
+        for row in rows_found:
+            if row.of_map is None and map_of_layer(row.name) is not None:
+                self._maps.pop(row.number, None)
+        return rows_found
 
     def _commit(self, row: MapRow, commit: CommitId, query: str) -> StoredCommit | None:
         robot, incarnation = commit.author

@@ -148,6 +148,8 @@ LATER = {
     "commits": "robot, incarnation, n",
     "tile": "layer, tile",
     "mark": "commit_number, n",
+    "attachment": "sha, uploader",
+    "attachment_part": "sha, uploader, begin_bytes",
     "held": "account, region",
     "retracted": "id",
     "vector_mark": "seq",
@@ -194,23 +196,32 @@ LEAVE_SEGMENTS = """
 
 
 def delete_map(connection: Connection, row: MapRow, *, by: str) -> GoneMap:
-    """End a map and its tokens inside a transaction; most of its rows stay (`clear_part`).
+    """End a map, its layers and their tokens inside a transaction; most of their rows stay (`clear_part`).
 
     Raises:
         NotFoundError: kind `gone`.
     """
+    # Layers first, in the order in which pushes to them lock heads.
+    layers = "SELECT map FROM map WHERE starts_with(name, %s)"
+    connection.execute(f"SELECT 1 FROM head WHERE map IN ({layers}) FOR UPDATE".encode(), (f"{row.name}.",))
     if first(connection, "SELECT 1 FROM head WHERE map = %s FOR UPDATE", (row.number,)) is None:
         raise lost_map(connection, row.number)
+    for number, name in rows(connection, "SELECT map, name FROM map WHERE starts_with(name, %s)", (f"{row.name}.",)):
+        _end(connection, number, name, by=by)
+    return _end(connection, row.number, row.name, by=by)
+
+
+def _end(connection: Connection, number: int, name: str, *, by: str) -> GoneMap:
     deleted_s = first(
         connection,
         f"INSERT INTO gone_map (map, name, deleted_s, by) VALUES (%s, %s, {NOW_S}, %s) RETURNING deleted_s",
-        (row.number, row.name, by),
+        (number, name, by),
     )
     query = "INSERT INTO gone_token (hash, map) SELECT hash, map FROM token WHERE map = %s ON CONFLICT DO NOTHING"
-    connection.execute(query, (row.number,))
+    connection.execute(query, (number,))
     for table in ("token", *AT_ONCE, "map"):
-        connection.execute(f"DELETE FROM {table} WHERE map = %s".encode(), (row.number,))
-    return GoneMap(number=row.number, name=row.name, deleted_s=deleted_s, by=by)
+        connection.execute(f"DELETE FROM {table} WHERE map = %s".encode(), (number,))
+    return GoneMap(number=number, name=name, deleted_s=deleted_s, by=by)
 
 
 def clear_part(connection: Connection, *, size_bytes_max: int, age_s: float) -> bool:

@@ -403,8 +403,38 @@ CREATE TABLE mark (
 CREATE INDEX mark_changed ON mark (map, changed_seq, low_x, low_y, low_z, high_x, high_y, high_z);
 ALTER TABLE author ADD COLUMN marks bigint NOT NULL DEFAULT 0;          -- of its commits, that are not taken out
 """
+LAYERS = "COMMENT ON COLUMN map.name IS 'of a map, or MAP.LAYER: of a further layer of one'"
+LAYERS_OLDEST = 11
+"""Oldest step whose programs work on a store with maps of several layers: others take the commit that defines one for
+damaged, and its name for none of a map."""
 MARKS_OLDEST = 10
 """Oldest step whose programs work on a store with marks: others take a commit with marks for a damaged one."""
+ATTACHMENTS = """
+ALTER TABLE mark ADD COLUMN attached_sha bytea;         -- SHA-256 of its attachment; NULL: none, or it was taken out
+ALTER TABLE mark ADD COLUMN attached_bytes bigint;      -- size that it states
+CREATE INDEX mark_attached ON mark (map, attached_sha) WHERE attached_sha IS NOT NULL;
+CREATE TABLE attachment (
+    map bigint,
+    sha bytea,
+    uploader text,                                  -- name of the token that sends it; empty: whole, with that SHA-256
+    account text NOT NULL,                          -- robot whose mark names it
+    size_bytes bigint NOT NULL,
+    held_bytes bigint NOT NULL,
+    idle_age_s float8,                              -- age of the store since which nothing keeps it; NULL: it is kept
+    PRIMARY KEY (map, sha, uploader)
+);
+CREATE TABLE attachment_part (
+    map bigint,
+    sha bytea,
+    uploader text,
+    begin_bytes bigint,
+    body bytea NOT NULL,
+    PRIMARY KEY (map, sha, uploader, begin_bytes)
+);
+ALTER TABLE attachment_part ALTER COLUMN body SET STORAGE EXTERNAL;     -- pictures do not shrink
+"""
+ATTACHMENTS_OLDEST = 12
+"""Oldest step whose programs read a mark with an attachment."""
 BOUND_OLDEST = 4
 """Oldest step whose programs read a store of which bytes are in an object store."""
 
@@ -420,7 +450,10 @@ class Step:
 
 STEPS = tuple(
     Step(sql, oldest=1)
-    for sql in (FIRST, REPLICAS, SERVERS, OBJECTS, OWNED_OBJECTS, EPOCHS, CLOCK, ADDRESSES, GONE, MARKS)
+    for sql in (
+        *(FIRST, REPLICAS, SERVERS, OBJECTS, OWNED_OBJECTS, EPOCHS, CLOCK, ADDRESSES, GONE, MARKS, LAYERS),
+        ATTACHMENTS,
+    )
 )
 
 

@@ -176,6 +176,15 @@ def lock_head(connection: Connection, row: MapRow) -> None:
         raise lost_map(connection, row.number)
 
 
+def lock_names(connection: Connection, row: MapRow) -> None:
+    """Lock the head by which the robots' names of a map and of its layers are bound; after the layer's own, if any.
+
+    Two first keys of one name that come to two layers at the same time cannot both be first.
+    """
+    if row.of_map is not None:
+        connection.execute("SELECT 1 FROM head WHERE map = %s FOR NO KEY UPDATE", (row.of_map,))
+
+
 class PgShares:
     """`store.Shares`."""
 

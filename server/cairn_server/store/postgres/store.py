@@ -3,39 +3,42 @@
 import logging
 import secrets
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from functools import partial
+from typing import Any, TypeVar
 
-from cairn_map.commits.cursor import Cursor, first_chain
+from cairn_map.commits.cursor import Cursor
 from cairn_map.commits.ids import Author
 from cairn_map.epochs.epoch import BASE, Epoch
 from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import UnreachableError
-from cairn_map.evidence.fingerprint import ZERO
 from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.map_refusals import GoneMap, check_same_map
 from cairn_server.store.admission import OWN_WORD, Grounds
+from cairn_server.store.attachments.attachment_rows import AttachmentRows, Query
 from cairn_server.store.objects.cold_bytes import ColdReads
 from cairn_server.store.postgres.branches import PgBranches
 from cairn_server.store.postgres.connections import NOTING, Connection, Connections, first
-from cairn_server.store.postgres.failures import missing_map
+from cairn_server.store.postgres.failures import lost_map, missing_map
 from cairn_server.store.postgres.folds import PgLeases, write_fold
 from cairn_server.store.postgres.health import PgHealth, PgUses
-from cairn_server.store.postgres.pushes import append_commit, append_slowly, next_number
+from cairn_server.store.postgres.pushes import append_commit, append_slowly, insert_map, next_number
 from cairn_server.store.postgres.reads import PgReads
 from cairn_server.store.postgres.replica_notes import PgReplicaNotes
 from cairn_server.store.postgres.retention import DYING, clear_part, delete_map, forget_evidence
 from cairn_server.store.postgres.robot_keys import PgAdmittedKeys
-from cairn_server.store.postgres.schema import EPOCHS_OLDEST, NOW_S, bar_older_programs, prepare
+from cairn_server.store.postgres.schema import NOW_S, prepare
 from cairn_server.store.postgres.shares import PgShares
 from cairn_server.store.postgres.tokens import PgAuditLog, PgTokens
 from cairn_server.store.postgres.writing_threads import WritingThreads
 from cairn_server.store.store_age import CLOCKS, AgeMark, Clocks, StoreAge
 from cairn_server.store.store_clock import ClockMark, clock_mark_from_text
 from cairn_server.store.store_rows import Branch, Fold, MapRow, NewCommit
+
+T = TypeVar("T")
 
 log = logging.getLogger(__name__)
 
@@ -51,8 +54,6 @@ RETURNING age_s, wall_s
 """The age of the store goes on by the time since any server ticked last, by the database's clock: so all servers have
 one age. Time in which none ran does not count, nor does a jump of that clock: each ticks every 60 s."""
 NOW = f"SELECT {NOW_S}"
-NUMBER_BITS = 52
-"""Bits of a map's number: exact in any program that reads numbers as floats."""
 CONNECTIONS = 48
 """Most connections of one server to the database, which allows 100 by default."""
 NAMES_S = 1.0
@@ -92,6 +93,35 @@ class PgClock:
         self._threads.note(lambda connection: connection.execute(query, values))
 
 
+class AttachmentTables:
+    """`attachment_rows.Database` of a database."""
+
+    def __init__(self, connections: Connections) -> None:
+        self._connections = connections
+
+    def run(self, job: Callable[[Query], T]) -> T:
+        """Result of a job in one transaction, which may be run again."""
+        return self._connections.run(lambda connection: job(partial(_rows_of, connection)))
+
+    @contextmanager
+    def reading(self) -> Iterator[Query]:
+        """Function for readings, for the length of a `with`."""
+        with self._connections.lent() as connection:
+            yield partial(_rows_of, connection)
+
+    def check_lives(self, query: Query, map_number: int) -> None:
+        """Lock the head of a map, which a deletion takes away first, or refuse to write to it."""
+        if not query("SELECT 1 FROM head WHERE map = ? FOR NO KEY UPDATE", (map_number,)):
+            with self._connections.lent() as connection:
+                raise lost_map(connection, map_number)
+
+
+def _rows_of(connection: Connection, statement: str, values: Sequence[Any]) -> list[tuple[Any, ...]]:
+    """Rows of a statement whose values are marked as SQLite does."""
+    cursor = connection.execute(statement.replace("?", "%s").encode(), values, binary=True)
+    return cursor.fetchall() if cursor.description else []
+
+
 class PgStore(PgReads):
     """`store.Store` in a database."""
 
@@ -127,6 +157,7 @@ class PgStore(PgReads):
         self.keys = PgAdmittedKeys(self._connections)
         self.uses = PgUses(self._connections)
         self.shares = PgShares(self._connections)
+        self.attachments = AttachmentRows(AttachmentTables(self._connections))
         self.audit_log = PgAuditLog(self._connections)
         self.health = PgHealth(
             self._connections, self._threads, self.age, objects=self._objects, size_bytes_max=size_bytes_max
@@ -141,32 +172,8 @@ class PgStore(PgReads):
     ) -> tuple[MapRow, bool]:
         """The map and whether it is new; an equal one may exist already."""
         layer = MapLayer(geometry=geometry, epoch_s=epoch_s)
-        log_id = secrets.token_bytes(16)
-        # Random, not the next one: servers remember maps that a database put back to an older state has lost, and none
-        # made since may have the number of one of these.
-        number = 1 + secrets.randbits(NUMBER_BITS)
-        texts = geometry.model_dump_json(), sensor_model.model_dump_json()
-        values = (number, name, *texts, secrets.token_bytes(32), layer.epoch_s)
-
-        def job(connection: Connection) -> bool:
-            made = connection.execute(
-                "INSERT INTO map (map, name, geometry, sensor_model, seal_key, epoch_s) OVERRIDING SYSTEM VALUE"
-                " VALUES (%s, %s, %s, %s, %s, %s) ON CONFLICT (name) DO NOTHING",
-                values,
-            )
-            if not made.rowcount:
-                return False
-            if layer.has_epochs:
-                bar_older_programs(
-                    connection, EPOCHS_OLDEST, what="maps with epochs", instead="make a map without epochs"
-                )
-            connection.execute(
-                "INSERT INTO head (map, log_id, seq, chain, fingerprint) VALUES (%s, %s, 0, %s, %s)",
-                (number, log_id, first_chain(log_id, layer.digest()), ZERO.to_bytes()),
-            )
-            return True
-
-        is_new = self._connections.run(job)
+        key = secrets.token_bytes(32)
+        is_new = self._connections.run(lambda connection: insert_map(connection, name, layer, sensor_model, key))
         self._names = {}  # another server may have deleted the one that had the name
         row = self.map(name)
         check_same_map(name, (row.layer, row.sensor_model), (layer, sensor_model))

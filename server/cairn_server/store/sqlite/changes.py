@@ -1,15 +1,28 @@
 """Writes of commits and folds, each function inside one transaction of the writer."""
 
+import json
+import secrets
 import time
 
 import apsw
 
-from cairn_map.commits.cursor import ENTRY_FOLD
-from cairn_map.commits.ids import CommitId
+from cairn_map.commits.cursor import ENTRY_FOLD, first_chain
+from cairn_map.commits.ids import CommitId, new_incarnation
+from cairn_map.epochs.layer import LayerDefinition, MapLayer
 from cairn_map.errors import ConflictError
+from cairn_map.evidence.grid import Geometry
+from cairn_map.evidence.inverse_sensor_model import SensorModel
+from cairn_server.map_refusals import check_layer_count, check_same_layer
 from cairn_server.store.history import KnownVectors, crosses_mark
 from cairn_server.store.shares import check_marks, own_targets
-from cairn_server.store.sqlite.retention import check_kept, check_lives, count_kept, is_retracted, remember_evidence
+from cairn_server.store.sqlite.retention import (
+    check_kept,
+    check_lives,
+    count_kept,
+    is_retracted,
+    next_map_number,
+    remember_evidence,
+)
 from cairn_server.store.sqlite.robot_keys import admit_commit
 from cairn_server.store.sqlite.schema import MAPS
 from cairn_server.store.sqlite.shares import give_back_sums, note_number, take_sums
@@ -17,10 +30,15 @@ from cairn_server.store.sqlite.snapshot import SqliteSnapshot
 from cairn_server.store.sqlite.tile_rows import TileWriter, mark_at, recount_tile
 from cairn_server.store.sqlite.writer import first
 from cairn_server.store.store_rows import CellRow, Fold, MapRow, NewCommit
-from cairn_server.store.stored_columns import CORNERS, epoch_to_column
+from cairn_server.store.stored_columns import CORNERS, attached_columns, epoch_to_column
 from cairn_server.store.tiles import tile_of
 
-INSERT_MARK = f"INSERT INTO mark (map, commit_number, n, {', '.join(CORNERS)}, record) VALUES ({', '.join('?' * 10)})"  # noqa: S608 - our own columns
+INSERT_MAP = (
+    "INSERT INTO map (number, name, geometry, sensor_model, operator, log_id, seq, chain, tops, epoch_s, seal_key)"
+    " VALUES (?, ?, ?, ?, ?, ?, 0, ?, ?, ?, ?)"
+)
+MARK_COLUMNS = ("map", "commit_number", "n", *CORNERS, "record", "attached_sha", "attached_bytes")
+INSERT_MARK = f"INSERT INTO mark ({', '.join(MARK_COLUMNS)}) VALUES ({', '.join('?' * len(MARK_COLUMNS))})"  # noqa: S608 - our own columns
 
 
 def append_commit(connection: apsw.Connection, row: MapRow, commit: NewCommit, *, age_s: float) -> bool:
@@ -69,7 +87,36 @@ def append_commit(connection: apsw.Connection, row: MapRow, commit: NewCommit, *
     number = connection.last_insert_rowid()
     _insert_diff(connection, number, commit)
     _insert_marks(connection, row, number, commit)
+    if commit.layer is not None:
+        _begin_layer(connection, row, commit.layer)
     return True
+
+
+def insert_map(connection: apsw.Connection, name: str, layer: MapLayer, model: SensorModel, seal_key: bytes) -> None:
+    """Write the row of a new map, or of a new layer of one."""
+    number, log_id = next_map_number(connection), secrets.token_bytes(16)
+    texts = layer.geometry.model_dump_json(), model.model_dump_json()
+    chain, tops = first_chain(log_id, layer.digest()), json.dumps([0] * (2 + layer.geometry.plane_count))
+    values = (number, name, *texts, new_incarnation(), log_id, chain, tops, layer.epoch_s, seal_key)
+    connection.execute(INSERT_MAP, values)
+
+
+def _begin_layer(connection: apsw.Connection, row: MapRow, definition: LayerDefinition) -> None:
+    """Make a layer that a new commit defines, unless an equal one is there.
+
+    Raises:
+        ConflictError: kind `other_layer` or `too_many_layers`.
+    """
+    name = f"{row.name}.{definition.name}"
+    found = first(connection, "SELECT geometry, epoch_s FROM map WHERE name = ?", (name,))
+    if found:
+        known = MapLayer(geometry=Geometry.model_validate_json(found[0]), epoch_s=found[1])
+        check_same_layer(name, known, definition)
+        return
+    check_layer_count(row.name, first(connection, "SELECT count(*) FROM map WHERE name GLOB ?", (f"{row.name}.*",)))
+    layer = MapLayer(geometry=definition.geometry, epoch_s=definition.epoch_s)
+    # Its servers sign, and know their own retracts again, by the key of the map.
+    insert_map(connection, name, layer, row.sensor_model, row.seal_key)
 
 
 def next_number(connection: apsw.Connection, row: MapRow, author: tuple[str, str]) -> int:
@@ -189,7 +236,10 @@ def _insert_marks(connection: apsw.Connection, row: MapRow, number: int, commit:
     check_marks(commit, held - sum(_held_of(connection, row, target) for target in own_targets(commit)))
     connection.executemany(
         INSERT_MARK,
-        [(row.number, number, n, *mark.low_mm, *mark.high_mm, mark.to_json()) for n, mark in enumerate(commit.marks)],
+        [
+            (row.number, number, n, *mark.low_mm, *mark.high_mm, mark.to_json(), *attached_columns(mark))
+            for n, mark in enumerate(commit.marks)
+        ],
     )
     _count_marks(connection, row, number, len(commit.marks))
 
@@ -211,7 +261,10 @@ def _bring_marks(connection: apsw.Connection, row: MapRow, number: int, seq: int
 
 def _take_marks_out(connection: apsw.Connection, row: MapRow, number: int, seq: int) -> None:
     """Note the log entry that took the marks of a commit out, whose records go."""
-    query = "UPDATE mark SET changed_seq = ?, record = NULL WHERE map = ? AND commit_number = ? AND record IS NOT NULL"
+    query = (
+        "UPDATE mark SET changed_seq = ?, record = NULL, attached_sha = NULL"
+        " WHERE map = ? AND commit_number = ? AND record IS NOT NULL"
+    )
     connection.execute(query, (seq, row.number, number))
     if connection.changes():
         _count_marks(connection, row, number, -connection.changes())

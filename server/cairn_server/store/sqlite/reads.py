@@ -7,7 +7,7 @@ from contextlib import contextmanager
 import apsw
 
 from cairn_map.commits.cursor import Cursor
-from cairn_map.commits.ids import Author, CommitId
+from cairn_map.commits.ids import Author, CommitId, map_of_layer
 from cairn_map.evidence.grid import CellKey, Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.store.history import KnownVectors
@@ -30,6 +30,10 @@ class SqliteReads:
     def maps(self) -> list[MapRow]:
         """All maps, by name."""
         return self.map_rows("ORDER BY name", ())
+
+    def layers(self, row: MapRow) -> list[MapRow]:
+        """Further layers of a map, by name."""
+        return self.map_rows("WHERE name GLOB ? ORDER BY name", (f"{row.name}.*",))
 
     def heads(self, numbers: Collection[int] | None = None) -> list[tuple[MapRow, Cursor]]:
         """All maps, or those of these numbers that there are, with their present states."""
@@ -112,14 +116,19 @@ class SqliteReads:
         if known is None or known.seal_key != seal_key:
             query = "SELECT name, geometry, sensor_model, epoch_s FROM map WHERE number = ?"
             name, geometry, sensor_model, epoch_s = first(reader, query, (number,))
-            known = self._maps[number] = MapRow(
+            whole = map_of_layer(name)
+            known = MapRow(
                 number=number,
                 name=name,
                 geometry=Geometry.model_validate_json(geometry),
                 sensor_model=SensorModel.model_validate_json(sensor_model),
                 seal_key=seal_key,
                 epoch_s=epoch_s,
+                of_map=None if whole is None else first(reader, "SELECT number FROM map WHERE name = ?", (whole,)),
             )
+            # The map of a layer that came out of an archive may follow it.
+            if whole is None or known.of_map is not None:
+                self._maps[number] = known
         return known
 
     def _commit(self, clause: str, row: MapRow, commit: CommitId) -> StoredCommit | None:

@@ -120,6 +120,7 @@ SMALL = {
     "log": "seq",
     "tile": "tile",
     "mark": "commit_number, n",
+    "attachment": "sha, uploader",
     "held": "account, region",
     "author": "robot, incarnation",
     "retracted": "id",
@@ -161,16 +162,21 @@ def next_map_number(connection: apsw.Connection) -> int:
 
 
 def delete_map(connection: apsw.Connection, row: MapRow, ended: EndedTokens, *, by: str) -> GoneMap:
-    """End a map and its tokens inside a transaction; its rows stay (`clear_part`)."""
+    """End a map, its layers and their tokens inside a transaction; their rows stay (`clear_part`)."""
     check_lives(connection, row.number)
-    gone = GoneMap(number=row.number, name=row.name, deleted_s=time.time(), by=by)
+    for number, name in rows(connection, "SELECT number, name FROM map WHERE name GLOB ?", (f"{row.name}.*",)):
+        _end(connection, GoneMap(number=number, name=name, deleted_s=time.time(), by=by), ended)
+    return _end(connection, GoneMap(number=row.number, name=row.name, deleted_s=time.time(), by=by), ended)
+
+
+def _end(connection: apsw.Connection, gone: GoneMap, ended: EndedTokens) -> GoneMap:
     values = (gone.number, gone.name, gone.deleted_s, gone.by)
     connection.execute("INSERT INTO gone_map (number, name, deleted_s, by) VALUES (?, ?, ?, ?)", values)
-    connection.execute("INSERT INTO gone_token (hash, map) SELECT hash, map FROM token WHERE map = ?", (row.number,))
-    ended.note_map(connection, row.number)
-    connection.execute("DELETE FROM token WHERE map = ?", (row.number,))
+    connection.execute("INSERT INTO gone_token (hash, map) SELECT hash, map FROM token WHERE map = ?", (gone.number,))
+    ended.note_map(connection, gone.number)
+    connection.execute("DELETE FROM token WHERE map = ?", (gone.number,))
     # No name of a map has a slash.
-    connection.execute("UPDATE map SET name = '/' || number WHERE number = ?", (row.number,))
+    connection.execute("UPDATE map SET name = '/' || number WHERE number = ?", (gone.number,))
     return gone
 
 
@@ -180,7 +186,7 @@ def clear_part(connection: apsw.Connection, *, size_bytes_max: int) -> bool:
     if number is None:
         return False
     left_bytes = size_bytes_max
-    for clear in (_clear_commits, _clear_cells):
+    for clear in (_clear_commits, _clear_cells, _clear_attachments):
         left_bytes -= clear(connection, number, left_bytes)
         if left_bytes <= 0:
             return True
@@ -226,6 +232,18 @@ def _clear_cells(connection: apsw.Connection, number: int, left_bytes: int) -> i
             went += ROW_BYTES + int(size_bytes)
             if went >= left_bytes:
                 return went
+    return went
+
+
+def _clear_attachments(connection: apsw.Connection, number: int, left_bytes: int) -> int:
+    """Remove parts of attachments; bytes that went."""
+    went = 0
+    query = "SELECT rowid, length(body) FROM attachment_part WHERE map = ? LIMIT ?"
+    for part, size_bytes in rows(connection, query, (number, ROWS_MAX)):
+        if went >= left_bytes:
+            break
+        connection.execute("DELETE FROM attachment_part WHERE rowid = ?", (part,))
+        went += ROW_BYTES + int(size_bytes)
     return went
 
 

@@ -24,7 +24,9 @@ class SqliteAdmittedKeys:
     def all(self, row: MapRow) -> list[RobotKey]:
         """All admitted keys, by robot and incarnation."""
         with self._readers.reading() as reader:
-            return [_key(*found) for found in rows(reader, f"{_SELECT} ORDER BY robot, incarnation", (row.number,))]
+            return [
+                _key(*found) for found in rows(reader, f"{_SELECT} ORDER BY robot, incarnation", (row.names_number,))
+            ]
 
     def of(self, row: MapRow, robot: str) -> dict[Incarnation, RobotKey]:
         """Admitted keys of a robot."""
@@ -46,7 +48,7 @@ def admit_commit(connection: apsw.Connection, row: MapRow, author: Author, groun
     if author.robot in SERVERS_OWN:
         return
     query = "SELECT is_proven FROM robot_key WHERE map = ? AND robot = ? AND incarnation = ?"
-    is_proven, signs = first(connection, query, (row.number, *author)), author.incarnation in grounds.signers
+    is_proven, signs = first(connection, query, (row.names_number, *author)), author.incarnation in grounds.signers
     if is_proven is None:
         check_commit(author, grounds, _known(connection, row, author.robot))
     if is_proven is None or (signs and not is_proven):
@@ -57,11 +59,13 @@ def admit_registration(connection: apsw.Connection, row: MapRow, author: Author,
     """Admit a registration inside its transaction, or refuse it (`admission.check_registration`)."""
     check_registration(author, grounds, _known(connection, row, author.robot))
     _put(connection, row, author, is_proven=author.incarnation in grounds.signers, by=grounds.by)
-    connection.execute("UPDATE robot_key SET may_return = 0 WHERE map = ? AND robot = ?", (row.number, author.robot))
+    connection.execute(
+        "UPDATE robot_key SET may_return = 0 WHERE map = ? AND robot = ?", (row.names_number, author.robot)
+    )
 
 
 def _known(connection: apsw.Connection, row: MapRow, robot: str) -> dict[Incarnation, RobotKey]:
-    found = [_key(*values) for values in rows(connection, f"{_SELECT} AND robot = ?", (row.number, robot))]
+    found = [_key(*values) for values in rows(connection, f"{_SELECT} AND robot = ?", (row.names_number, robot))]
     return {key.author.incarnation: key for key in found}
 
 
@@ -78,7 +82,7 @@ def _put(
         "INSERT INTO robot_key (map, robot, incarnation, is_proven, may_return, since_s, by)"
         " VALUES (?, ?, ?, ?, ?, ?, ?) ON CONFLICT (map, robot, incarnation) DO UPDATE SET"
         " is_proven = max(is_proven, excluded.is_proven), may_return = max(may_return, excluded.may_return)",
-        (row.number, *author, is_proven, may_return, time.time(), by),
+        (row.names_number, *author, is_proven, may_return, time.time(), by),
     )
 
 

@@ -366,6 +366,34 @@ CREATE INDEX mark_changed ON mark (map, changed_seq, low_x, low_y, low_z, high_x
 ALTER TABLE author ADD COLUMN marks INTEGER NOT NULL DEFAULT 0;     -- of its commits, that are not taken out
 """
 
+LAYERS = """
+-- Earlier programs take a commit of version 4 for a damaged one, and the name of a layer for none of a map.
+"""
+
+ATTACHMENTS = """
+ALTER TABLE mark ADD COLUMN attached_sha BLOB;      -- SHA-256 of its attachment; NULL: it has none, or was taken out
+ALTER TABLE mark ADD COLUMN attached_bytes INTEGER; -- size that it states
+CREATE INDEX mark_attached ON mark (map, attached_sha) WHERE attached_sha IS NOT NULL;
+CREATE TABLE attachment (
+    map INTEGER NOT NULL REFERENCES map,
+    sha BLOB NOT NULL,
+    uploader TEXT NOT NULL,         -- name of the token that sends it; empty: whole, with that SHA-256
+    account TEXT NOT NULL,          -- robot whose mark names it
+    size_bytes INTEGER NOT NULL,
+    held_bytes INTEGER NOT NULL,
+    idle_age_s REAL,                -- age of the store since which nothing keeps it; NULL: something does
+    PRIMARY KEY (map, sha, uploader)
+) WITHOUT ROWID;
+CREATE TABLE attachment_part (
+    map INTEGER NOT NULL REFERENCES map,
+    sha BLOB NOT NULL,
+    uploader TEXT NOT NULL,
+    begin_bytes INTEGER NOT NULL,
+    body BLOB NOT NULL,
+    PRIMARY KEY (map, sha, uploader, begin_bytes)
+);
+"""
+
 STEPS = (
     FIRST,
     STAMPS,
@@ -387,6 +415,8 @@ STEPS = (
     ADDRESSES,
     GONE,
     MARKS,
+    LAYERS,
+    ATTACHMENTS,
 )
 
 

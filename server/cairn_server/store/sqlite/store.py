@@ -5,29 +5,32 @@ import logging
 import os
 import secrets
 from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future
 from concurrent.futures import TimeoutError as FutureTimeoutError
-from contextlib import suppress
+from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import apsw
 
-from cairn_map.commits.cursor import Cursor, first_chain
-from cairn_map.commits.ids import Author, Incarnation, RobotName, new_incarnation
+from cairn_map.commits.cursor import Cursor
+from cairn_map.commits.ids import Author, Incarnation, RobotName
 from cairn_map.epochs.epoch import BASE, Epoch
 from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import BadInputError, NotFoundError, UnreachableError
 from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.wire.access_messages import AuditText
-from cairn_server.map_refusals import GoneMap, check_same_map
+from cairn_server.map_refusals import GoneMap, check_same_map, map_gone
 from cairn_server.store.admission import OWN_WORD, Grounds
+from cairn_server.store.attachments.attachment_rows import AttachmentRows, Query
 from cairn_server.store.branch_signs import LastSeen
 from cairn_server.store.folder_lock import lock_folder
 from cairn_server.store.private_files import close_to_others, make_private
 from cairn_server.store.sqlite.branches import SqliteBranchNotes, stored_branches
-from cairn_server.store.sqlite.changes import append_commit, heal_cell, next_number, write_fold
+from cairn_server.store.sqlite.changes import append_commit, heal_cell, insert_map, next_number, write_fold
 from cairn_server.store.sqlite.ended_tokens import LIST_NAME, EndedTokens
 from cairn_server.store.sqlite.failures import FULL, disk_full, opening_failure
 from cairn_server.store.sqlite.old_sums import measure_old_sums
@@ -40,7 +43,6 @@ from cairn_server.store.sqlite.retention import (
     delete_map,
     forget_evidence,
     missing_map,
-    next_map_number,
 )
 from cairn_server.store.sqlite.robot_keys import SqliteAdmittedKeys, admit_registration
 from cairn_server.store.sqlite.schema import MAPS, WAITING, WAITING_MAPS, ensure_schema
@@ -82,6 +84,8 @@ SHRINK_PAGES = 64
 MAPS_MAX = 1000
 """Most maps whose backlogs are listed."""
 
+T = TypeVar("T")
+
 log = logging.getLogger(__name__)
 
 FILE_NAME = "cairn.sqlite"
@@ -121,6 +125,33 @@ class SqliteClock:
             self._writer.submit(lambda connection: rows(connection, "UPDATE age SET clock = ?", (mark.to_text(),)))
 
 
+class AttachmentTables:
+    """`attachment_rows.Database` of one file."""
+
+    def __init__(self, readers: Readers, writer: Writer | None = None) -> None:
+        """Without a writer nothing is written."""
+        self._readers = readers
+        self._writer = writer
+
+    def run(self, job: Callable[[Query], T]) -> T:
+        """Result of a job in one transaction of the writer."""
+        if self._writer is None:
+            raise BadInputError("bad_store", "this file is only read")
+        return self._writer.run(lambda connection: job(partial(rows, connection)))
+
+    @contextmanager
+    def reading(self) -> Iterator[Query]:
+        """Function for readings, for the length of a `with`."""
+        with self._readers.reading() as reader:
+            yield partial(rows, reader)
+
+    def check_lives(self, query: Query, map_number: int) -> None:
+        """Refuse to write to a map that was deleted."""
+        found = query("SELECT number, name, deleted_s, by FROM gone_map WHERE number = ?", (map_number,))
+        if found:
+            raise map_gone(GoneMap(**dict(zip(("number", "name", "deleted_s", "by"), found[0], strict=True))))
+
+
 class SqliteStore(SqliteReads):
     """`store.Store` in a folder, which one process has (`folder_lock`)."""
 
@@ -158,6 +189,7 @@ class SqliteStore(SqliteReads):
         self.keys = SqliteAdmittedKeys(self._writer, self._readers)
         self.uses = SqliteUses(self._readers)
         self.shares = SqliteShares(self._writer, self._readers)
+        self.attachments = AttachmentRows(AttachmentTables(self._readers, self._writer))
         self.audit_log = SqliteAuditLog(self._writer, self._readers)
         self.health = SqliteHealth(path, self._writer, self._readers, self.age)
         self._names: dict[str, MapRow] = {}  # of maps, which never change
@@ -175,23 +207,7 @@ class SqliteStore(SqliteReads):
                 known = MapLayer(geometry=Geometry.model_validate_json(found[0]), epoch_s=found[1])
                 check_same_map(name, (known, SensorModel.model_validate_json(found[2])), (layer, sensor_model))
                 return False
-            number, log_id = next_map_number(connection), secrets.token_bytes(16)
-            tops = [0] * (2 + geometry.plane_count)
-            connection.execute(
-                "INSERT INTO map (number, name, geometry, sensor_model, operator, log_id, seq, chain, tops, epoch_s,"
-                " seal_key) VALUES (?, ?, ?, ?, ?, ?, 0, ?, ?, ?, randomblob(32))",
-                (
-                    number,
-                    name,
-                    geometry.model_dump_json(),
-                    sensor_model.model_dump_json(),
-                    new_incarnation(),
-                    log_id,
-                    first_chain(log_id, layer.digest()),
-                    json.dumps(tops),
-                    layer.epoch_s,
-                ),
-            )
+            insert_map(connection, name, layer, sensor_model, secrets.token_bytes(32))
             return True
 
         is_new = self._writer.run(job)

@@ -63,6 +63,7 @@ def new_commit(commit: Commit, tops: Mapping[int, tuple[int, ...]], *, bricks: i
         rig=bytes.fromhex(commit.meta.rig) if commit.meta.rig else None,
         epoch=commit.meta.row,
         marks=commit.meta.marks,
+        layer=commit.meta.layer,
     )
 
 

@@ -21,6 +21,7 @@ from cairn_map.evidence.channels import SAMPLE_MAX, planes_and_squares
 from cairn_map.evidence.evidence_kernels import bounds_of_counts, channel_above
 from cairn_map.evidence.grid import Geometry, cell_of_key
 from cairn_server.access.auth import Caller
+from cairn_server.map_refusals import layer_of_map
 from cairn_server.store.store_rows import MapRow
 
 MAIN = "main"
@@ -38,8 +39,9 @@ def check_claims(row: MapRow, caller: Caller, id_text: str, meta: CommitMeta, *,
 
     Raises:
         BadInputError: kind `other_id`, `other_geometry`, `other_layer`, `reserved_name`, `bad_commit`, `bad_mark`,
-            `bad_place` or `too_large`.
-        DeniedError: kind `not_allowed`: made by, or retracting from, a robot that the caller is not.
+            `bad_place`, `layer_of_map` or `too_large`.
+        DeniedError: kind `not_allowed`: made by, or retracting from, a robot that the caller is not; or a robot defines
+            a layer.
         DamagedDataError: kind `empty_commit`.
     """
     if meta.id != id_text:
@@ -54,8 +56,9 @@ def check_claims(row: MapRow, caller: Caller, id_text: str, meta: CommitMeta, *,
     times = [*(meta.captured_s or ()), *(scan.time_s for scan in meta.scans)]
     if any(abs(time_s) > TIME_MAX_S for time_s in times):
         raise BadInputError("bad_commit", f"a time of the commit is beyond {TIME_MAX_S:g} s since 1970")
-    if not cells and not meta.retracts and not meta.marks:
+    if not cells and not meta.retracts and not meta.marks and meta.layer is None:
         raise DamagedDataError("empty_commit", "a commit must hold evidence or marks, or name commits to retract")
+    _check_part_of_map(row, meta)
     for mark in meta.marks:
         check_place(mark, row.geometry)
         # Who reads `by` trusts the server that wrote it: a robot has no other name than its own.
@@ -63,6 +66,23 @@ def check_claims(row: MapRow, caller: Caller, id_text: str, meta: CommitMeta, *,
             said = f"the mark {mark.name!r} speaks for {mark.by!r}; a robot marks in its own name, without `by`"
             raise BadInputError("bad_mark", said)
     _check_room(meta)
+
+
+def _check_part_of_map(row: MapRow, meta: CommitMeta) -> None:
+    """Refuse what only a map as a whole has, its marks and layers, in a layer; and layers by any author but operators.
+
+    Raises:
+        BadInputError: kind `layer_of_map`.
+        DeniedError: kind `not_allowed`.
+    """
+    if row.of_map is not None and meta.marks:
+        raise layer_of_map(row.name, "marks are the map's; push them there")
+    if meta.layer is None:
+        return
+    if row.of_map is not None:
+        raise layer_of_map(row.name, "a layer has no layers; push its definition to the map")
+    if meta.commit_id.author.robot != OPERATOR:
+        raise DeniedError("not_allowed", "an operator defines layers (cairn map layer add); a robot maps into them")
 
 
 def _check_room(meta: CommitMeta) -> None:

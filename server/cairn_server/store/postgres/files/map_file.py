@@ -25,8 +25,14 @@ from cairn_map.errors import ConflictError, NotFoundError
 from cairn_map.evidence.grid import Geometry
 from cairn_server.store.objects.cold_bytes import ColdReads, split_cell_object
 from cairn_server.store.postgres.connections import Connection, Connections, first, rows
-from cairn_server.store.postgres.schema import EPOCHS_OLDEST, MARKS_OLDEST, bar_older_programs
-from cairn_server.store.postgres.store import NUMBER_BITS
+from cairn_server.store.postgres.pushes import NUMBER_BITS
+from cairn_server.store.postgres.schema import (
+    ATTACHMENTS_OLDEST,
+    EPOCHS_OLDEST,
+    LAYERS_OLDEST,
+    MARKS_OLDEST,
+    bar_older_programs,
+)
 from cairn_server.store.shares import limits_of
 from cairn_server.store.stored_columns import TableRows
 
@@ -41,7 +47,10 @@ TABLES = {
     "cell": "cell, lm, digest, fingerprint, voxels, size_bytes, gone_seq, hottest_k, history_bytes, body, stamps,"
     " object",
     "tile": "tile, lm, cells, size_bytes, fingerprint, history_bytes",
-    "mark": "commit_number, n, changed_seq, low_x, low_y, low_z, high_x, high_y, high_z, record",
+    "mark": "commit_number, n, changed_seq, low_x, low_y, low_z, high_x, high_y, high_z, record, attached_sha,"
+    " attached_bytes",
+    "attachment": "sha, uploader, account, size_bytes, held_bytes",
+    "attachment_part": "sha, uploader, begin_bytes, body",
     "held": "account, region, tops, part",
     "author": "robot, incarnation, top, intervals, closed, kept_bytes, marks",
     "vector_mark": "seq, vector",
@@ -54,7 +63,12 @@ MAP = (
     "SELECT map, name, geometry, sensor_model, seal_key, epoch_s, log_id, seq, chain, folded, cells, cells_bytes,"
     " fingerprint, history_bytes, corners FROM map JOIN head USING (map) WHERE name = %s"
 )
+DEFINES = (
+    "SELECT EXISTS (SELECT FROM commits WHERE map = %s AND cells = 0 AND position('\"layer\":'::bytea IN meta) > 0)"
+)
+"""SQL that finds a commit which defines a layer; in texts of a meta a quote has a backslash before it."""
 HAS_MARKS = "SELECT EXISTS (SELECT FROM mark WHERE map = %s)"
+HAS_ATTACHED = "SELECT EXISTS (SELECT FROM mark WHERE map = %s AND attached_sha IS NOT NULL)"
 HEAD = ("log_id", "seq", "chain", "folded", "cells", "cells_bytes", "fingerprint", "history_bytes")
 BOOLEANS = frozenset({"closed", "gone", "is_proven", "may_return"})
 ARRAYS = frozenset({"regions", "tops", "corners"})
@@ -175,6 +189,11 @@ class _Putting:
             self._write(table.name, map(self._here, found))
         if table.name == "mark" and first(self._connection, HAS_MARKS, (self.number,)):
             self._bar_older("marks", MARKS_OLDEST)
+            if first(self._connection, HAS_ATTACHED, (self.number,)):
+                self._bar_older("attachments of marks", ATTACHMENTS_OLDEST)
+        has_layers = "." in self.name or (table.name == "commits" and first(self._connection, DEFINES, (self.number,)))
+        if has_layers:
+            self._bar_older("layers", LAYERS_OLDEST)
 
     def _map(self, values: Mapping[str, Any]) -> None:
         self.name = values["name"]
@@ -216,7 +235,7 @@ class _Putting:
         values |= {name: bool(values[name]) for name in BOOLEANS.intersection(values)}
         if "commit_number" in values:
             values["commit_number"] = self._commits[values["commit_number"]]
-        if "account" in values:
+        if {"account", "tops"} <= values.keys():
             (tops,) = iter_unpack(f"<{self._planes}q", values["tops"])
             room = min(map(sub, limits_of(values["account"], self._planes), tops))
             values |= {"tops": list(tops), "room": room}

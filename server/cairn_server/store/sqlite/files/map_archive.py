@@ -22,7 +22,7 @@ from cairn_server.store.sqlite.schema import STEPS, ensure_schema, newer_store
 from cairn_server.store.sqlite.writer import connect, connect_to_store, first, rows
 from cairn_server.store.stored_columns import TableRows
 
-MOVED = {"map": ":map", "commit_number": "commit_number + :shift"}
+MOVED = {"map": ":map", "commit_number": "commit_number + :shift", "idle_age_s": "NULL"}
 """SQL of what columns hold in the other store, where that is something else."""
 AGES = {"received_age_s": "received_age_s + :later_s", "folded_age_s": "folded_age_s + :later_s"}
 TABLES = (
@@ -34,6 +34,8 @@ TABLES = (
     "cell",
     "tile",
     "mark",
+    "attachment",
+    "attachment_part",
     "held",
     "author",
     "vector_mark",

@@ -1,0 +1,106 @@
+"""Layers of a map: the same site at several resolutions, for robots that see it from far and from near.
+
+    $ cairn map layer add http://127.0.0.1:8750/maps/lab fine --voxel 0.01
+    layer fine of map lab: voxels of 1 cm, cells of 1.28 m, channels colour, intensity, temperature, epochs of 120 s
+    robots map into it at http://127.0.0.1:8750/maps/lab.fine
+    $ cairn map layer list http://127.0.0.1:8750/maps/lab
+    layer                    voxel     cell  cells      size  URL
+    evidence                  4 cm   5.12 m     56   12.4 MB  http://127.0.0.1:8750/maps/lab
+    fine                      1 cm   1.28 m      0       0 B  http://127.0.0.1:8750/maps/lab.fine
+
+A map begins with one layer, `evidence`, and has at most 16. Each is pushed to, fetched, queried, drawn and exported
+under its own URL, by every command that takes a map's: MAP.LAYER. Robots' names, tokens, marks and the sensor model are
+those of the map. A definition is a commit: relays carry it, and it never changes; another definition under the same
+name is refused (`other_layer`), also on a server that is joined later. It takes an operator's token to add one.
+"""
+
+import argparse
+import json
+
+from pydantic import ValidationError
+
+from cairn_client.cli.arguments import (
+    EPOCH_HELP,
+    NO_EPOCHS,
+    Subparsers,
+    add_map_parser,
+    api_of,
+    channels_from_text,
+    epoch_s_from_text,
+    say,
+    shown_bytes,
+    shown_length,
+)
+from cairn_map.errors import BadInputError, first_error
+from cairn_map.evidence.grid import geometry_for
+from cairn_map.wire.layer_messages import AddLayer, LayerInfo
+
+
+def add_parser(commands: Subparsers) -> None:
+    """Add the subcommand, and its own."""
+    text = "add layers of other resolutions to a map, and list them"
+    parts = commands.add_parser("layer", help=text, description=__doc__).add_subparsers(
+        required=True, metavar="COMMAND"
+    )
+    _add_add(parts)
+    _add_list(parts)
+
+
+def _add_add(commands: Subparsers) -> None:
+    add = add_map_parser(commands, "add", _add, text="add a layer to a map; takes an operator's token")
+    add.add_argument("name", help="its name: a letter, then a-z, 0-9 and _, at most 32")
+    add.add_argument("--voxel", type=float, required=True, metavar="METRES", help="voxel edge, 0.001 to 1")
+    add.add_argument("--channels", help="colour,intensity,temperature, scalars as NAME:UNIT:STEP (those of the map)")
+    add.add_argument("--epoch", metavar=f"SECONDS|{NO_EPOCHS}", help=f"{EPOCH_HELP} (that of the map)")
+    add.add_argument("--json", action="store_true", help="print JSON")
+
+
+def _add_list(commands: Subparsers) -> None:
+    listing = add_map_parser(commands, "list", _list, text="list the layers of a map")
+    listing.add_argument("--json", action="store_true", help="print JSON")
+
+
+def _add(args: argparse.Namespace) -> int:
+    api, name = api_of(args.map, args.token)
+    with api:
+        info = api.map_info(name)
+        channels = info.geometry.channels if args.channels is None else channels_from_text(args.channels)
+        geometry = geometry_for(voxel_edge_m=args.voxel, channels=channels)
+        epoch_s = epoch_s_from_text(args.epoch, otherwise=info.epoch_s)
+        try:
+            request = AddLayer(name=args.name, geometry=geometry, epoch_s=epoch_s)
+        except ValidationError as exc:
+            raise BadInputError("bad_layer", f"the layer cannot be: {first_error(exc)}") from exc
+        added = api.add_layer(name, request)
+    if args.json:
+        say(added.model_dump_json())
+        return 0
+    layer = added.layer
+    names = ", ".join(channel.name for channel in layer.geometry.channels) or "none but occupancy"
+    epochs = "" if layer.epoch_s is None else f", epochs of {layer.epoch_s} s"
+    say(
+        f"layer {layer.name} of map {name}: voxels of {shown_length(layer.geometry.voxel_edge_m)}, "
+        f"cells of {layer.geometry.cell_edge_m:g} m, channels {names}{epochs}"
+    )
+    say(f"robots map into it at {_url(args.map, name, layer)}")
+    return 0
+
+
+def _list(args: argparse.Namespace) -> int:
+    api, name = api_of(args.map, args.token)
+    with api:
+        layers = api.layers(name)
+    if args.json:
+        say(json.dumps([layer.model_dump(mode="json") for layer in layers]))
+        return 0
+    say(f"{'layer':<20} {'voxel':>9} {'cell':>8} {'cells':>6} {'size':>9}  URL")
+    for layer in layers:
+        voxel, size = shown_length(layer.geometry.voxel_edge_m), shown_bytes(layer.size_bytes)
+        cell = f"{layer.geometry.cell_edge_m:g} m"
+        url = _url(args.map, name, layer)
+        say(f"{layer.name:<20} {voxel:>9} {cell:>8} {layer.cells:>6} {size:>9}  {url}")
+    return 0
+
+
+def _url(map_url: str, name: str, layer: LayerInfo) -> str:
+    return map_url.rstrip("/").removesuffix(name) + layer.map

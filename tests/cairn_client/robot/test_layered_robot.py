@@ -1,0 +1,137 @@
+"""A robot on several layers: each gets its scans at its resolution, one key vouches for all, the finest answers."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.fixtures.client.made import GEOMETRY, MAP
+from tests.fixtures.client.robot_program import INTEGRATOR, RIG, scan_of
+from tests.fixtures.server.access import ADMIN, ENROLLER
+from tests.fixtures.server.live import Live
+
+from cairn_client.robot.layered_robot import LayeredRobot
+from cairn_client.robot.robot import Robot
+from cairn_fusion.mapping.integrate import integrate_scan
+from cairn_map.epochs.history_map import HistoryMap
+from cairn_map.epochs.layer import EVIDENCE, MapLayer
+from cairn_map.errors import BadInputError, DeniedError
+from cairn_map.evidence.grid import Geometry
+from cairn_map.wire.layer_messages import AddLayer
+from cairn_map.wire.messages import CreateMap
+from cairn_server.access.auth import ADMIN_FILE
+
+GRIDS = {
+    EVIDENCE: GEOMETRY,
+    "fine": Geometry(voxel_edge_um=25_000, depth=4, channels=GEOMETRY.channels),
+    "wide": Geometry(voxel_edge_um=200_000, depth=3, channels=GEOMETRY.channels),
+}
+
+
+@pytest.fixture
+def live(tmp_path: Path) -> Iterator[Live]:
+    """A server with a map of three layers."""
+    with Live(tmp_path / "server", admin_token=ADMIN, enrolment_token=ENROLLER, stable_after_s=0) as server:
+        server.service.maps.create(MAP, CreateMap(geometry=GEOMETRY))
+        row = server.service.store.map(MAP)
+        for name in ("fine", "wide"):
+            server.service.sync.layers.add(row, AddLayer(name=name, geometry=GRIDS[name]), by=ADMIN_FILE)
+        yield server
+
+
+def url_of(live: Live, layer: str = EVIDENCE) -> str:
+    return f"http://127.0.0.1:{live.port}/maps/{MAP}" + ("" if layer == EVIDENCE else f".{layer}")
+
+
+def opened(live: Live, folder: Path, contributes: list[str], fetches: list[str], *, name: str = "mole") -> LayeredRobot:
+    return LayeredRobot(
+        RIG,
+        url_of(live),
+        directory=folder / name,
+        name=name,
+        contributes=contributes,
+        fetches=fetches,
+        token=ENROLLER,
+        integrators=dict.fromkeys(GRIDS, INTEGRATOR),
+    )
+
+
+def made(layer: str, *seeds: int) -> HistoryMap:
+    """Evidence of some scans at the resolution of a layer."""
+    total = HistoryMap(MapLayer(geometry=GRIDS[layer]))
+    for seed in seeds:
+        total.merge(integrate_scan(scan_of(seed), RIG, GRIDS[layer], integrator=INTEGRATOR))
+    return total
+
+
+def test_scans_go_into_the_layers_that_a_robot_maps_into_and_the_finest_that_knows_answers(
+    live: Live, tmp_path: Path
+) -> None:
+    with opened(live, tmp_path, [EVIDENCE, "fine"], ["wide"]) as mole:
+        mole.observe(scan_of(1))
+        assert mole.commit().keys() == {EVIDENCE, "fine"}
+        mole.observe(scan_of(2), into=[EVIDENCE])
+        assert mole.commit().keys() == {EVIDENCE}
+        with opened(live, tmp_path, ["wide"], [EVIDENCE, "fine"], name="wren") as wren:
+            wren.observe(scan_of(3))
+            wren.commit()
+            wren.sync(until_folded=True)
+            mole.sync(until_folded=True)
+            wren.sync()
+        expected = {EVIDENCE: made(EVIDENCE, 1, 2), "fine": made("fine", 1), "wide": made("wide", 3)}
+        for robot in (mole, wren):
+            assert {layer: each.map for layer, each in robot.robots.items()} == expected
+        # Each point from the finest layer that knows it.
+        layers = mole.snapshot()
+        seen = [layers[layer].voxels_in().centres_m for layer in layers.names]
+        chance = np.random.default_rng(1)
+        points = np.concatenate([*(chance.permutation(each)[:60] for each in seen), np.full((1, 3), 90.0)])
+        names = layers.names_at(points)
+        assert {*names} == {"fine", EVIDENCE, "wide", None}
+        for point, name, state in zip(points, names, layers.state_at(points), strict=True):
+            finest = next((each for each in layers.names if layers[each].state_at([point])[0]), None)
+            assert (name, state) == (finest, 0 if finest is None else layers[finest].state_at([point])[0])
+
+
+def test_a_name_is_one_robot_s_on_all_layers(live: Live, tmp_path: Path) -> None:
+    with opened(live, tmp_path, ["fine"], [EVIDENCE]) as mole:
+        mole.observe(scan_of(1))
+        mole.commit()
+        mole.sync()
+    # A third folder, later, is vouched for by the others.
+    with opened(live, tmp_path, ["fine", "wide"], [EVIDENCE]) as mole:
+        mole.observe(scan_of(2))
+        mole.commit()
+        mole.sync(until_folded=True)
+        assert [robot.waiting for robot in mole.robots.values()] == [0, 0, 0]
+    # Another machine that takes the name is let in nowhere.
+    for layer in GRIDS:
+        with Robot(
+            None, url_of(live, layer), directory=tmp_path / f"thief-{layer}", name="mole", token=ENROLLER
+        ) as thief:
+            with pytest.raises(DeniedError) as refused:
+                thief.sync()
+            assert refused.value.kind == "not_admitted"
+
+
+def test_what_no_layered_robot_can_be_is_refused(live: Live, tmp_path: Path) -> None:
+    for contributes, fetches in (([], ["wide"]), (["fine", "fine"], []), (["fine"], ["fine"])):
+        with pytest.raises(BadInputError, match="one layer at least, each named once"):
+            opened(live, tmp_path, contributes, fetches)
+    with pytest.raises(BadInputError, match="take the map's URL"):
+        LayeredRobot(
+            RIG, url_of(live, "fine"), directory=tmp_path / "a", name="a", contributes=["wide"], token=ENROLLER
+        )
+    with opened(live, tmp_path, ["fine"], ["wide"]) as mole:
+        with pytest.raises(BadInputError, match="maps into"):
+            mole.observe(scan_of(1), into=["wide"])
+        with pytest.raises(BadInputError, match="marks are the map's"):
+            mole.robots["fine"].mark("lamp", (0, 0, 0))
+        with pytest.raises(BadInputError, match="marks are the map's"):
+            mole.robots["fine"].marks()
+    # The folder of one robot lends its keys to no other.
+    with pytest.raises(BadInputError) as refused:
+        LayeredRobot(
+            RIG, url_of(live), directory=tmp_path / "mole", name="wren", contributes=["fine", "wide"], token=ENROLLER
+        )
+    assert refused.value.kind == "other_replica"
