@@ -93,7 +93,7 @@ class PgClock:
         self._threads.note(lambda connection: connection.execute(query, values))
 
 
-class AttachmentTables:
+class PgAttachmentTables:
     """`attachment_rows.Database` of a database."""
 
     def __init__(self, connections: Connections) -> None:
@@ -157,7 +157,7 @@ class PgStore(PgReads):
         self.keys = PgAdmittedKeys(self._connections)
         self.uses = PgUses(self._connections)
         self.shares = PgShares(self._connections)
-        self.attachments = AttachmentRows(AttachmentTables(self._connections))
+        self.attachments = AttachmentRows(PgAttachmentTables(self._connections))
         self.audit_log = PgAuditLog(self._connections)
         self.health = PgHealth(
             self._connections, self._threads, self.age, objects=self._objects, size_bytes_max=size_bytes_max

@@ -16,7 +16,7 @@ from cairn_server.store.attachments.attachment_rows import AttachmentRows
 from cairn_server.store.sqlite.readers import Readers
 from cairn_server.store.sqlite.reads import SqliteReads
 from cairn_server.store.sqlite.schema import STEPS, newer_store
-from cairn_server.store.sqlite.store import AttachmentTables, SqliteStore
+from cairn_server.store.sqlite.store import SqliteAttachmentTables, SqliteStore
 from cairn_server.store.sqlite.writer import connect_to_store, first, rows
 
 COMPLAINTS_MAX = 20
@@ -39,7 +39,7 @@ class SqliteArchive(SqliteStore):
             raise NotFoundError("no_store", f"there is no store {path}")
         connect_to_store(path).close()
         SqliteReads.__init__(self, Readers(path))
-        self.attachments = AttachmentRows(AttachmentTables(self._readers))
+        self.attachments = AttachmentRows(SqliteAttachmentTables(self._readers))
         with self._readers.reading() as reader:
             version = reader.pragma("user_version")
         if version > len(STEPS):

@@ -125,7 +125,7 @@ class SqliteClock:
             self._writer.submit(lambda connection: rows(connection, "UPDATE age SET clock = ?", (mark.to_text(),)))
 
 
-class AttachmentTables:
+class SqliteAttachmentTables:
     """`attachment_rows.Database` of one file."""
 
     def __init__(self, readers: Readers, writer: Writer | None = None) -> None:
@@ -189,7 +189,7 @@ class SqliteStore(SqliteReads):
         self.keys = SqliteAdmittedKeys(self._writer, self._readers)
         self.uses = SqliteUses(self._readers)
         self.shares = SqliteShares(self._writer, self._readers)
-        self.attachments = AttachmentRows(AttachmentTables(self._readers, self._writer))
+        self.attachments = AttachmentRows(SqliteAttachmentTables(self._readers, self._writer))
         self.audit_log = SqliteAuditLog(self._writer, self._readers)
         self.health = SqliteHealth(path, self._writer, self._readers, self.age)
         self._names: dict[str, MapRow] = {}  # of maps, which never change
