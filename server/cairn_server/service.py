@@ -72,6 +72,7 @@ from cairn_server.views.hottest_search import HottestSearch
 from cairn_server.views.map_changes import MapChangesSearch
 from cairn_server.views.map_exports import MapExports
 from cairn_server.views.map_views import MapViews
+from cairn_server.views.value_spread import ValueSpread
 
 KEEP_FULL_AUTHORS_S = 300.0
 """Time for which the list of filling shares of authors is kept, however often the metrics are asked for."""
@@ -105,6 +106,7 @@ class ViewParts:
     tickets: ExportTickets
     changes: MapChangesSearch
     hottest: HottestSearch
+    spread: ValueSpread
 
 
 class Service:
@@ -214,6 +216,7 @@ class Service:
             ExportTickets(self.store, self.holders, exports),
             MapChangesSearch(self.store, self.cells),
             HottestSearch(self.store, self.cells),
+            ValueSpread(self.store, self.cells),
         )
 
     def _folded(self, row: MapRow) -> None:

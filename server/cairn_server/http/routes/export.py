@@ -13,6 +13,7 @@ from cairn_map.files.export_request import BOX_CHARS_MAX, EXPORT_TYPES, ExportRe
 from cairn_map.render.render_request import RenderRequest
 from cairn_map.wire.change_messages import ChangesAnswer
 from cairn_map.wire.hottest_messages import HOTTEST_MAX, HottestAnswer
+from cairn_map.wire.spread_messages import SpreadAnswer
 from cairn_server.access.connection_places import ConnectionPlace
 from cairn_server.http.middleware.deadlines import PLACE
 from cairn_server.http.routes.callers import READERS, Asking, Credentials, Map, Operations
@@ -98,6 +99,12 @@ def hottest(
 ) -> HottestAnswer:
     """The occupied voxels of the highest temperature: first those that were seen twice or touch a surface."""
     return service.views.hottest.asked(row, count, box)
+
+
+@router.get("/maps/{name}/main/spread", dependencies=READERS)
+def spread(service: Operations, row: Map) -> SpreadAnswer:
+    """Histograms of the heights and temperatures of all occupied voxels: the ends of a colour bar."""
+    return service.views.spread.asked(row)
 
 
 async def map_without_ticket(name: str, request: Request, asker: Asking) -> MapRow | None:
