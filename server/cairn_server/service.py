@@ -73,6 +73,7 @@ from cairn_server.views.hottest_search import HottestSearch
 from cairn_server.views.map_changes import MapChangesSearch
 from cairn_server.views.map_exports import MapExports
 from cairn_server.views.map_views import MapViews
+from cairn_server.views.value_spread import ValueSpread
 
 KEEP_FULL_AUTHORS_S = 300.0
 """Time for which the list of filling shares of authors is kept, however often the metrics are asked for."""
@@ -107,6 +108,7 @@ class ViewParts:
     changes: MapChangesSearch
     hottest: HottestSearch
     hot_spots: HotSpotSearch
+    spread: ValueSpread
 
 
 class Service:
@@ -217,6 +219,7 @@ class Service:
             MapChangesSearch(self.store, self.cells),
             HottestSearch(self.store, self.cells),
             HotSpotSearch(self.store, self.cells, cache_share=self.settings.memory.cache_share),
+            ValueSpread(self.store, self.cells),
         )
 
     def _folded(self, row: MapRow) -> None:

@@ -21,7 +21,8 @@ CHROMIUM = shutil.which("chromium")
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-dev-shm-usage"]
 """WebGL without a graphics card, in a container that has no namespaces and little shared memory."""
 SETTLED = """c && c.cells.all.size > 0 && c.cells.waiting === 0 && c.cells.running === 0
-  && !c.cells.needsPlan && !c.moved"""
+  && !c.cells.needsPlan && !c.moved && !c.spread.isBehind(c.cells.head)
+  && !c.stage.isMoving"""
 DEADLINE_S = 60.0
 LOADED_MACHINE = 10
 """Factor on the console's time limits: a machine that runs other tests at the same time is so much slower."""
@@ -49,9 +50,11 @@ class Console:
         page.on("console", lambda said: self.errors.append(said.text) if said.type == "error" else None)
         page.on("request", lambda request: self.requests.append(request.url))
 
-    def open(self, look: str = "") -> None:
+    def open(self, look: str | None = None) -> None:
+        """Open a map; without a look that of the room, all of it: no ceiling is cut off."""
         assert self.room is not None
-        self.page.goto(f"{self.room.url}/?test=1{look}")
+        shown = f"#map={self.room.name}&ceiling=off" if look is None else look
+        self.page.goto(f"{self.room.url}/?test=1{shown}")
 
     def log_in(self, token: str = ADMIN_TOKEN) -> None:
         self.page.get_by_label("Token").fill(token)

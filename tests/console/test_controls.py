@@ -12,6 +12,17 @@ from tests.console.room import GEOMETRY, Room
 pytestmark = pytest.mark.browser
 
 EYES_M = 1.6
+WALK_STEPS = 40
+"""More than a room is long."""
+STEPPED_ON_M, LOW_M = 0.5, 0.1
+"""Over the floor what is higher is in the way; and more than the floor itself."""
+WAY_M = 0.5
+"""A step, and half of a body at its corners."""
+WALKS = """[[0, 1], [0, -1], [1, 0], [-1, 0]].map(([right, forward]) => {
+  c.stage.place(a[1]);
+  return Array.from({ length: a[0] }, () => (c.walk(right, forward), c.stage.view.eye));
+})"""
+"""Where who walks straight on comes by, from one place ahead, back, right and left."""
 NEAREST_M, BEFORE_M, FAR_M = 0.3, 0.1, float(np.hypot(3, 2.2))
 """Of the eye from who is followed, and from what would be in between."""
 
@@ -163,3 +174,74 @@ def test_a_robot_may_be_let_go_while_its_picture_comes(console: Console) -> None
     console.settled()
     assert console.page.locator("figure.seen:visible").count() == 0
     assert console.errors == []
+
+
+def test_who_walks_goes_as_far_as_the_walls_let(console: Console, room: Room) -> None:
+    page, edge_m = console.page, GEOMETRY.voxel_edge_m
+    page.keyboard.press("h")
+    page.keyboard.press("w")
+    console.settled()
+    start = console.tell("c.stage.view")
+    page.keyboard.press("s")
+    assert np.subtract(console.tell("c.stage.view.eye"), start["eye"])[:2] @ ahead(console)[:2] < -0.1, "a step back"
+    corners = np.asarray(occupied(room).numbers * edge_m, np.float64)
+    stopped = 0
+    for path in np.array(console.tell(WALKS, WALK_STEPS, start)):
+        assert min(away_from(corners, eye, STEPPED_ON_M) for eye in path) > 0, "never in a wall"
+        if (path[-1] == path[-2]).all():
+            stopped += 1
+            # Where the next step leads down, what lies lower is in the way, too.
+            assert away_from(corners, path[-1], LOW_M) <= WAY_M + edge_m, "something is in the way"
+    assert stopped > 0
+    assert ahead(console)[2] == pytest.approx(0, abs=1e-6), "still level"
+    eye, way = console.tell("c.stage.view.eye"), ahead(console)
+    page.keyboard.press("ArrowLeft")
+    assert console.tell("c.stage.view.eye") == pytest.approx(eye, abs=1e-6), "who looks around stays where they are"
+    assert np.degrees(np.arccos(ahead(console) @ way)) == pytest.approx(6, abs=0.1)
+    page.keyboard.press("Escape")
+    assert console.tell("[c.walker.isOn, c.stage.controls.enabled]") == [False, True]
+
+
+def away_from(corners: npt.NDArray[np.float64], eye: npt.NDArray[np.float64], over_m: float) -> float:
+    """How far the nearest voxel, so high over the floor, is from the middle of a body whose eyes are here, level, m."""
+    half_m = GEOMETRY.voxel_edge_m / 2
+    body = (corners[:, 2] + 2 * half_m > eye[2] - EYES_M + over_m) & (corners[:, 2] < eye[2])
+    off = np.maximum(np.abs(corners[body, :2] + half_m - eye[:2]) - half_m, 0)
+    return float(np.hypot(*off.T).min())
+
+
+def test_back_undoes_a_flight_and_a_reload_keeps_the_view(console: Console) -> None:
+    page = console.page
+    console.tell("c.setField('height')")
+    page.keyboard.press("t")
+    console.settled()
+    page.get_by_label("Floor").fill("40")
+    above, floor = console.tell("c.stage.view.eye"), console.tell("c.look.floorM")
+    page.locator(".host canvas").focus()
+    page.keyboard.press("h")
+    console.settled()
+    assert console.tell("c.stage.view.eye") != above
+    page.go_back()
+    console.until(f"Math.abs(c.stage.view.eye[2] - {above[2]}) < 0.01", "the eye is above again")
+    assert console.tell("c.look.floorM") == pytest.approx(floor, abs=0.006)
+    page.reload()
+    console.settled()
+    assert console.tell("c.stage.view.eye") == pytest.approx(above, abs=0.006)
+    assert console.tell("[c.look.field, c.look.floorM]") == ["height", pytest.approx(floor, abs=0.006)]
+    assert "boxes" not in console.tell("c.address")
+    page.get_by_label("Floor").fill("0")
+    page.locator(".host canvas").focus()
+    console.tell("c.setField('colour')")
+
+
+def test_a_double_click_brings_the_eye_there(console: Console) -> None:
+    page = console.page
+    page.keyboard.press("h")
+    console.settled()
+    place = console.tell("c.picker.at(350, 320)?.point.toArray()")
+    before = np.linalg.norm(np.subtract(console.tell("c.stage.view.eye"), place))
+    page.locator(".host canvas").dblclick(position={"x": 350, "y": 320})
+    console.settled()
+    view = console.tell("c.stage.view")
+    assert view["target"] == pytest.approx(place, abs=0.02)
+    assert np.linalg.norm(np.subtract(view["eye"], place)) < 0.7 * before

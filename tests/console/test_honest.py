@@ -32,7 +32,6 @@ SHOW_OFTEN = f"""() => {{
 
 
 def test_what_has_no_temperature_is_grey_and_not_cold(console: Console) -> None:
-    console.page.keyboard.press("g")
     console.page.keyboard.press("Shift+2")
     console.page.get_by_label("Ceiling").fill("120")
     console.page.locator(".host canvas").focus()
@@ -48,7 +47,6 @@ def test_what_has_no_temperature_is_grey_and_not_cold(console: Console) -> None:
     assert np.mean(spread[is_warm] > GREY_SPREAD_MAX) > 0.9
     console.page.get_by_label("Ceiling").fill("200")
     console.page.locator(".host canvas").focus()
-    console.page.keyboard.press("g")
 
 
 def test_ages_are_told_as_time_by_the_commits_own_clocks(console: Console, room: Room) -> None:

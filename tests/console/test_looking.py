@@ -33,7 +33,7 @@ GREY_SPREAD_MAX = 40
 
 STAIR, FIRST, NEXT, LAST, BEYOND, SCANS = "stair", (0, 0, 0), (1, 0, 3), (1, 0, 6), (1, 0, 9), 64
 """A map whose later cells lie higher than its first, and beside it; scans enough for its counts."""
-SIDEWAYS = "&by=height&boxes=1&cells=0&eye=0.2,-0.6,0.9&target=0.2,0.2,0.2"
+SIDEWAYS = "&by=height&boxes=1&eye=0.2,-0.6,0.9&target=0.2,0.2,0.2"
 
 BUDGET_SHARE, SLACK = 0.3, 1.15
 """Of the map's voxels; and how much more may be shown before cells are made coarser: scene/detail.ts."""

@@ -120,7 +120,8 @@ def test_another_colouring_asks_nothing_of_the_server_and_looks_otherwise(consol
         pictures[field] = console.picture()
         assert console.page.locator(f'[data-field="{field}"]').get_attribute("aria-pressed") == "true"
     # Who is behind, and who asks to be let in, is asked for every ten seconds, whatever is looked at.
-    by_the_clock = ("/branches", "/keys", "/robots")
+    # A browser looks up the page's icon in its cache with each change of the address.
+    by_the_clock = ("/branches", "/keys", "/robots", ".svg")
     assert [url for url in console.requests if not url.endswith(by_the_clock)] == []
     for field in ("temperature", "probability", "height", "robot"):
         assert np.abs(pictures[field].astype(int) - pictures["colour"]).mean() > 3, field

@@ -28,7 +28,7 @@ PLACE = (0.1, 0.0, 0.5)
 HALF = float(np.sqrt(0.5))
 LOOKS_NORTH, LOOKS_SOUTH = (-HALF, 0.0, 0.0, HALF), (HALF, 0.0, 0.0, HALF)
 """Quaternions that turn the rig's z axis, along which cameras look, into +y and -y of the map."""
-FROM_ABOVE = "&cells=0&eye=0.1,-0.01,6&target=0.1,0,0.5"
+FROM_ABOVE = "&eye=0.1,-0.01,6&target=0.1,0,0.5"
 """North is up in the picture."""
 GREY = (0x8B, 0x94, 0x9E)
 LATER_S = 90
@@ -158,6 +158,9 @@ def test_a_robot_is_drawn_where_it_is_and_looks_and_grey_when_it_is_gone(console
     assert status.pose is not None
     assert console.tell("c.team.marks.get('mole').position.toArray()") == pytest.approx(status.pose.t_map_rig)
     colour = colour_of(console, MOLE.robot)
+    # The dot of its label keeps the robot's colour, whoever is online.
+    dots = "[...document.querySelectorAll('.label .dot')].map((dot) => (dot.style.visibility = a[0]))"
+    console.tell(dots, "hidden")
     seen = {"north": drawn_in(console, colour)}
     look(crew, LOOKS_SOUTH)
     console.until("c.team.marks.get('mole').ahead.y < 0", "it turned round")
@@ -179,6 +182,7 @@ def test_a_robot_is_drawn_where_it_is_and_looks_and_grey_when_it_is_gone(console
     assert len(grey & was) > 0.9 * len(grey | was), "but for its label"
     assert len(drawn_in(console, colour)) == 0
     console.page.unroute(f"**/maps/{CREW}/**")
+    console.tell(dots, "visible")
     look(crew, LOOKS_NORTH)
     row.get_by_text("online").wait_for()
     assert console.errors == []

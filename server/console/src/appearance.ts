@@ -6,9 +6,10 @@ import type { Triple } from "./messages.ts";
 import { textureOf, type Palette } from "./palettes.ts";
 import type { Cells } from "./scene/cells.ts";
 import { boxes, FIELD_CODES, squares, uniforms } from "./scene/materials.ts";
+import type { Spread } from "./scene/spread.ts";
 import type { Stage } from "./scene/stage.ts";
 import { rangeOf } from "./scene/statistics.ts";
-import { Legend, type Told } from "./ui/legend.ts";
+import { Legend, type Told, type Values } from "./ui/legend.ts";
 import { applyTheme } from "./ui/top_bar.ts";
 import { KELVIN_ZERO_C } from "./units.ts";
 
@@ -20,13 +21,17 @@ export class Appearance {
   private readonly stage: Stage;
   private readonly cells: Cells;
   private readonly book: LogBook;
+  private readonly spread: Spread;
+  /** Height that is told as 0, m in the map. */
+  zeroM = 0;
   private readonly palettes = new Map<Palette, ReturnType<typeof textureOf>>();
 
-  constructor(look: Look, stage: Stage, cells: Cells, book: LogBook) {
+  constructor(look: Look, stage: Stage, cells: Cells, book: LogBook, spread: Spread) {
     this.look = look;
     this.stage = stage;
     this.cells = cells;
     this.book = book;
+    this.spread = spread;
     look.boxes ??= !stage.isSoftware;
   }
 
@@ -43,9 +48,8 @@ export class Appearance {
     uniforms.uLow.value.set(low[0], low[1], Math.max(low[2], look.floorM ?? -FAR_M));
     uniforms.uHigh.value.set(high[0], high[1], Math.min(high[2], look.ceilingM ?? FAR_M));
     uniforms.uMinP.value = look.minP;
-    const [from, to] = look.band ?? [1, 0];
-    const zero = look.band ? KELVIN_ZERO_C : 0;
-    uniforms.uBand.value.set(from + zero, to + zero);
+    if (look.band) uniforms.uBand.value.set(look.band[0] + KELVIN_ZERO_C, look.band[1] === null ? FAR_M : look.band[1] + KELVIN_ZERO_C);
+    else uniforms.uBand.value.set(1, 0);
     this.cells.setMaterial(look.boxes ? boxes : squares);
     this.refreshRange(robots);
   }
@@ -55,11 +59,22 @@ export class Appearance {
     const { look } = this;
     const { uLow, uHigh, uRange } = uniforms;
     const zero = look.field === "temperature" ? KELVIN_ZERO_C : 0;
-    const found = look.field === "colour" || look.field === "robot" ? null : rangeOf(this.cells, look.field, uLow.value.z, uHigh.value.z);
+    const found = look.field === "colour" || look.field === "robot" ? null
+      : (this.spread.range(look.field) ?? rangeOf(this.cells, look.field, uLow.value.z, uHigh.value.z));
     const range = look.ranges[look.field] ?? (found && (found.map((end) => end - zero) as [number, number]));
     if (range) uRange.value.set(range[0] + zero, range[1] + zero);
-    this.legend.show(look, range, robots, this.told(range));
+    this.legend.show(look, range, robots, this.told(range), this.valuesOf(zero));
     this.stage.draw();
+  }
+
+  /** The map's values in the look's unit; heights over the floor. */
+  private valuesOf(zero: number): Values {
+    const found = this.spread.of(this.look.field);
+    const isHeight = this.look.field === "height";
+    const shiftM = isHeight ? this.zeroM : 0;
+    if (!found) return { shift: shiftM, histogram: null };
+    const { least, most, begin, step, counts } = found;
+    return { shift: shiftM, histogram: { least: least - zero, most: most - zero, begin: begin - zero, step, counts } };
   }
 
   /** In what ages are told, and whether the log that is known here reaches back to all that is shown. */

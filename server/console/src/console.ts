@@ -1,28 +1,36 @@
 /** One map on the page: the picture, the panels around it, and what flows between them. */
 
+import { Vector3 } from "three";
 import { NONE_READY, type Api } from "./api.ts";
 import { Appearance } from "./appearance.ts";
 import { h } from "./dom.ts";
 import { Duties } from "./duties.ts";
 import { FindingsDesk } from "./findings_desk.ts";
+import { Heights } from "./heights.ts";
+import { KeptAddress } from "./kept_address.ts";
 import { LogBook } from "./log_book.ts";
 import { LiveLink, type LinkState } from "./live.ts";
 import { toHash, type CameraView, type Field, type Look } from "./look.ts";
-import type { LiveEvent, MapInfo } from "./messages.ts";
+import type { LiveEvent, MapInfo, Triple } from "./messages.ts";
 import { rgbOf, robotColour } from "./palettes.ts";
 import { Cells } from "./scene/cells.ts";
 import { CellGrid, Outline } from "./scene/lines.ts";
 import { Picker } from "./scene/picking.ts";
+import { Spread } from "./scene/spread.ts";
 import { Stage } from "./scene/stage.ts";
+import { Walker } from "./scene/walker.ts";
 import { Team } from "./team.ts";
 import { CameraPanel } from "./ui/camera_panel.ts";
+import { Chips } from "./ui/chips.ts";
 import { CommitStrip, SHOWN } from "./ui/commit_strip.ts";
+import { emptyMap } from "./ui/dead_ends.ts";
 import { openAsking, openFull } from "./ui/duty_dialogs.ts";
 import { DutyPanel } from "./ui/duty_panel.ts";
 import { LookPanel } from "./ui/look_panel.ts";
 import { mapFacts } from "./ui/map_facts.ts";
 import { MeasurePanel } from "./ui/measure_panel.ts";
 import { openCommit } from "./ui/retract_dialog.ts";
+import { ReferenceFrame } from "./ui/reference_frame.ts";
 import { TakeAwayPanel } from "./ui/take_away_panel.ts";
 import type { TopBar } from "./ui/top_bar.ts";
 import { VoxelPanel } from "./ui/voxel_panel.ts";
@@ -30,7 +38,10 @@ import { celsius, thousands } from "./units.ts";
 
 const UNSEEN_COLOUR = 0xffb000;
 const SOFTWARE_BUDGET = 150_000;
+const WALKING = "Walking: W A S D go, drag or arrows look around, Escape ends";
 const TICK_MS = 250;
+/** A double click brings the eye so near, m, or to a third of the way. */
+const NEAR_M = 1.5;
 const AGAIN_MS = 3000;
 
 export class Console {
@@ -47,7 +58,10 @@ export class Console {
   readonly voxel: VoxelPanel;
   readonly measure: MeasurePanel;
   readonly camera: CameraPanel;
+  readonly walker: Walker;
   readonly appearance: Appearance;
+  readonly spread: Spread;
+  readonly heights: Heights;
   private readonly api: Api;
   private readonly info: MapInfo;
   private readonly look: Look;
@@ -60,12 +74,17 @@ export class Console {
   private readonly unseen = new CellGrid(UNSEEN_COLOUR, 1);
   private readonly outline = new Outline();
   private readonly foot = h("span", { class: "figures" });
+  private readonly chips = new Chips();
+  private readonly labels = h("div", { class: "labels", "aria-hidden": "true" });
+  private readonly empty: HTMLElement;
+  private readonly frame: ReferenceFrame;
   private readonly flag = h("span", { class: "flag", role: "status" });
   private state: LinkState = { live: false, heardMs: null };
   private moved = true;
   private logged = false;
   private isAsking = false;
   private loading: Promise<void>;
+  private readonly kept = new KeptAddress(() => this.address);
   /** State that the index was last taken from. */
   private cursor = "";
   /** When to load again what could not be loaded, as of performance.now(). */
@@ -78,14 +97,15 @@ export class Console {
     this.look = look;
     this.bar = bar;
     const host = h("div", { class: "host" });
-    const labels = h("div", { class: "labels", "aria-hidden": "true" });
     this.book = new LogBook(api, info.name);
     this.duties = new Duties(api, info.name);
     this.voxel = new VoxelPanel(api, info.name, (seq) => this.book.robotAt(seq));
     this.takeAway = new TakeAwayPanel(api, info, look);
     this.panel = new LookPanel(look);
     this.measure = new MeasurePanel(info.geometry.voxel_edge_um / 1e6);
-    const view = h("main", { class: "view" }, host, labels, this.flag);
+    this.empty = emptyMap(info.name);
+    this.empty.hidden = true;
+    const view = h("main", { class: "view" }, host, this.empty, this.labels, h("div", { class: "notes" }, this.flag, this.chips.element));
     const left = h("aside", { class: "left", "aria-label": "Team and map" });
     const right = h("aside", { class: "right", "aria-label": "Tools" }, this.panel.element, this.voxel.element, this.measure.element, this.takeAway.element);
     this.element = h("div", { class: "console" }, left, view, right, h("footer", {}, this.strip.element, this.foot));
@@ -93,10 +113,16 @@ export class Console {
     this.stage = new Stage(host);
     this.cells = new Cells(api, info);
     this.cells.budget = this.stage.isSoftware ? SOFTWARE_BUDGET : 2_000_000;
-    this.team = new Team(api, info.name, labels, this.stage, this.cells);
+    this.spread = new Spread(api, info.name);
+    this.heights = new Heights(look, this.cells, this.spread);
+    this.team = new Team(api, info.name, this.labels, this.stage, this.cells);
     view.append(h("div", { class: "through" }, this.team.picture.element, this.team.fromPose.element));
     this.picker = new Picker(this.stage, this.cells);
-    this.stage.add(this.cells.group, this.grid.lines, this.unseen.lines, this.outline.lines, this.measure.lines, this.team.group);
+    this.stage.voxels.add(this.cells.group);
+    this.stage.add(this.grid.lines, this.unseen.lines, this.outline.lines, this.measure.lines, this.team.group);
+    this.frame = new ReferenceFrame(this.stage, this.picker);
+    view.append(this.frame.element);
+    this.walker = new Walker(this.stage, this.cells);
     this.camera = new CameraPanel(this.stage, this.cells, this.team, info, camera);
     this.findings = new FindingsDesk(api, info, { stage: this.stage, cells: this.cells, picker: this.picker }, look, {
       fly: (to) => this.camera.go(to), look: () => this.apply(), say: (text) => this.say(text), isOperator: () => this.duties.isOperator,
@@ -105,7 +131,7 @@ export class Console {
     this.stage.add(this.findings.pins.group);
     view.append(this.findings.pins.element, this.findings.alarm.banner);
     left.append(this.dutyPanel.element, this.findings.panel.element, this.camera.element, this.team.panel.element, mapFacts(info));
-    this.appearance = new Appearance(look, this.stage, this.cells, this.book);
+    this.appearance = new Appearance(look, this.stage, this.cells, this.book, this.spread);
     view.append(this.appearance.legend.element);
     this.connect(onRefused);
     this.loading = Promise.resolve();
@@ -120,10 +146,25 @@ export class Console {
   /** Compile the voxels' shaders on a voxel that nobody sees, while the first cells are on their way. */
   private async prepare(): Promise<void> {
     const sample = this.cells.sample();
-    this.stage.add(sample);
+    this.stage.voxels.add(sample);
     await this.stage.prepare();
-    this.stage.scene.remove(sample);
+    this.stage.voxels.remove(sample);
     sample.geometry.dispose();
+  }
+
+  get name(): string {
+    return this.info.name;
+  }
+
+  /** Show what another address of this map says: a link, or Back. */
+  take(look: Look, camera: CameraView): void {
+    Object.assign(this.look, look, { boxes: look.boxes ?? this.look.boxes });
+    this.heights.forget();
+    this.team.follow(null);
+    this.stage.place(camera);
+    this.camera.isPlaced = true;
+    this.kept.followed();
+    this.apply();
   }
 
   dispose(): void {
@@ -132,6 +173,7 @@ export class Console {
     this.cells.dispose();
     this.findings.dispose();
     this.picker.dispose();
+    this.frame.dispose();
     this.appearance.dispose();
     this.stage.dispose();
     this.element.remove();
@@ -144,6 +186,10 @@ export class Console {
 
   step(up: boolean): void {
     this.panel.step(up);
+  }
+
+  toggleCeiling(): void {
+    this.heights.toggleCeiling();
   }
 
   toggleGrid(): void {
@@ -175,11 +221,35 @@ export class Console {
     this.outline.show(picked);
     this.stage.draw();
     this.takeAway.choose(picked?.cell.key ?? null);
-    if (picked) void this.voxel.show(picked, this.cells.depthMax);
+    if (picked) void this.voxel.show(picked, this.cells.depthMax, this.heights.floorM);
     else this.voxel.clear();
   }
 
+  /** Fly to what lies under a place of the canvas, along the way one looks. */
+  private goTo(x: number, y: number): void {
+    const point = this.measure.isOn ? null : this.picker.at(x, y)?.point;
+    if (!point) return;
+    const { eye } = this.stage.view;
+    const back = new Vector3(...eye).sub(point);
+    const awayM = Math.min(Math.max(back.length() / 3, NEAR_M), back.length());
+    this.team.follow(null);
+    this.stage.fly({ eye: point.clone().addScaledVector(back.normalize(), awayM).toArray() as Triple, target: point.toArray() as Triple });
+  }
+
+  /** Turn: the head of who walks, or the picture around what is looked at. */
+  turn(right: number, down: number): void {
+    if (this.walker.isOn) this.walker.turn(right, down);
+    else this.stage.turn(-right, down);
+  }
+
+  /** A step ahead or aside; who does not walk yet begins to. */
+  walk(right: number, ahead: number): void {
+    if (this.walker.isOn) this.walker.step(right, ahead);
+    else if (ahead > 0) this.camera.walk();
+  }
+
   forget(): void {
+    this.walker.end();
     this.outline.show(null);
     this.team.follow(null);
     this.voxel.clear();
@@ -200,11 +270,19 @@ export class Console {
       if (down && Math.hypot(event.clientX - down[0], event.clientY - down[1]) < 4) this.ask(event.offsetX, event.offsetY);
       down = null;
     });
+    canvas.addEventListener("dblclick", ({ offsetX, offsetY }) => this.goTo(offsetX, offsetY));
     canvas.addEventListener("webglcontextrestored", () => this.stage.draw());
     this.stage.onMove = () => (this.moved = true);
+    // Back undoes a flight, but for the first one to where the map is.
+    this.stage.onFly = () => {
+      this.walker.end();
+      if (!this.camera.isPlaced) return;
+      this.kept.leave();
+    };
     this.stage.onFrame = () => {
       this.team.place();
       this.findings.pins.place();
+      this.frame.show();
       // Without a graphics card, frames would take the time of the cells that are still to come.
       return this.cells.isFresh && !(this.stage.isSoftware && this.cells.isFetching);
     };
@@ -226,6 +304,19 @@ export class Console {
     this.panel.onChange = () => this.apply();
     this.measure.onChange = () => this.stage.draw();
     this.panel.boxInView = () => this.picker.boxInView();
+    this.panel.onStorey = (storey) => this.heights.showStorey(storey);
+    this.heights.onCut = () => this.apply();
+    this.heights.onFloors = () => {
+      this.panel.stories(this.heights.storeys.floorsM);
+      this.appearance.zeroM = this.panel.zeroM;
+      this.frame.floorM = this.heights.floorM;
+      this.moved = true;
+    };
+    this.chips.onCeiling = () => this.toggleCeiling();
+    this.spread.onChange = () => {
+      this.moved = true;
+      this.heights.forget();
+    };
     this.appearance.legend.onRange = (range) => {
       if (range) this.look.ranges[this.look.field] = range;
       else delete this.look.ranges[this.look.field];
@@ -236,6 +327,10 @@ export class Console {
     this.dutyPanel.onFull = (robot) => openFull(this.api, this.info.name, this.duties, robot);
     this.team.onFollow = () => this.stage.draw();
     this.camera.onGo = () => this.say("");
+    this.camera.onWalk = () => {
+      this.walker.begin();
+      this.say(WALKING);
+    };
     this.camera.onNoFloor = () => this.say("Nobody could stand there: no floor is known.");
     this.camera.onHottest = (place) => {
       if (!place) return this.say("Nothing that is shown has a temperature.");
@@ -320,7 +415,10 @@ export class Console {
       this.plan();
       this.appearance.refreshRange(this.team.names);
     }
+    if (this.cursor) this.spread.tick(this.cells.head);
+    this.heights.tick();
     this.camera.settle();
+    this.kept.tick(this.camera.isPlaced && !this.stage.isFlying);
     const bounds = this.cells.tightBounds;
     if (!bounds.isEmpty()) this.panel.span(bounds.min.z, bounds.max.z);
     this.grid.lines.visible = this.look.cells;
@@ -338,6 +436,9 @@ export class Console {
     const { lastSeq } = this.team;
     const missed = lastSeq === null ? [] : [...this.cells.all.values()].filter(({ points, lm }) => points && lm > lastSeq);
     this.unseen.update(missed.map(({ box }) => box));
+    this.empty.hidden = this.cursor === "" || this.cells.all.size > 0;
+    this.labels.hidden = this.cells.firstPictureMs === null && this.cells.all.size > 0;
+    this.chips.show(this.look, this.cells, this.heights.storeys, this.panel.zeroM);
     const drawn = `${thousands(this.cells.drawn)} nodes of ${this.cells.all.size} cells`;
     this.foot.textContent = this.stage.isSoftware ? `${drawn} · drawn without a graphics card: coarser and slower` : drawn;
   }

@@ -21,12 +21,14 @@ export interface Look {
   /** What lies below or above is cut off; m in the map; null: nothing is. */
   floorM: number | null;
   ceilingM: number | null;
+  /** Somebody said where the ceiling is cut, or that it is not; else the page cuts off a roof by itself. */
+  isCeilingChosen: boolean;
   /** Lowest and highest corner of a box outside of which nothing is shown; m. */
   clip: [Triple, Triple] | null;
   /** Least probability shown. */
   minP: number;
-  /** Only these temperatures stand out; °C. */
-  band: [number, number] | null;
+  /** Only these temperatures stand out; °C; without an upper end all above. */
+  band: [number, number | null] | null;
   cells: boolean;
   boxes: boolean | null;
 }
@@ -38,7 +40,8 @@ export interface CameraView {
 
 export function defaultLook(): Look {
   return {
-    field: "colour", ranges: {}, floorM: null, ceilingM: null, clip: null, minP: 0, band: null, cells: true, boxes: null,
+    field: "colour", ranges: {}, floorM: null, ceilingM: null, isCeilingChosen: false, clip: null, minP: 0, band: null,
+    cells: false, boxes: null,
   };
 }
 
@@ -50,12 +53,11 @@ export function toHash(map: string, look: Look, camera: CameraView | null): stri
   if (look.field !== "colour") add("by", look.field);
   for (const [field, range] of Object.entries(look.ranges)) add(`range.${field}`, numbers(range));
   add("floor", look.floorM === null ? null : numbers([look.floorM]));
-  add("ceiling", look.ceilingM === null ? null : numbers([look.ceilingM]));
+  if (look.isCeilingChosen) add("ceiling", look.ceilingM === null ? "off" : numbers([look.ceilingM]));
   add("clip", look.clip && numbers(look.clip.flat()));
   add("p", look.minP > 0 ? numbers([look.minP]) : null);
-  add("band", look.band && numbers(look.band));
-  add("cells", look.cells ? null : "0");
-  add("boxes", look.boxes === null ? null : look.boxes ? "1" : "0");
+  add("band", look.band && `${numbers([look.band[0]])},${look.band[1] === null ? "" : numbers([look.band[1]])}`);
+  add("cells", look.cells ? "1" : null);
   add("eye", camera && numbers(camera.eye));
   add("target", camera && numbers(camera.target));
   return "#" + parts.map(([name, value]) => `${name}=${value}`).join("&");
@@ -76,11 +78,15 @@ export function fromHash(hash: string): { map: string | null; look: Look; camera
   }
   look.floorM = one("floor");
   look.ceilingM = one("ceiling");
+  look.isCeilingChosen = given.has("ceiling");
   const clip = numbers("clip", 6);
   if (clip) look.clip = [clip.slice(0, 3) as Triple, clip.slice(3) as Triple];
   look.minP = one("p") ?? 0;
-  look.band = numbers("band", 2) as [number, number] | null;
-  look.cells = given.get("cells") !== "0";
+  const isOpen = given.get("band")?.endsWith(",");
+  if (isOpen) given.set("band", given.get("band")!.slice(0, -1));
+  const band = isOpen ? [one("band"), null] : numbers("band", 2);
+  look.band = band && band[0] !== null ? (band as [number, number | null]) : null;
+  look.cells = given.get("cells") === "1";
   look.boxes = given.has("boxes") ? given.get("boxes") === "1" : null;
   const eye = numbers("eye", 3) as Triple | null;
   const target = numbers("target", 3) as Triple | null;

@@ -6,66 +6,77 @@ import { Console } from "./console.ts";
 import { fill, h } from "./dom.ts";
 import { FIELDS, fromHash } from "./look.ts";
 import type { MapInfo } from "./messages.ts";
+import { hasWebGl } from "./scene/stage.ts";
+import { message, noMap, pause, unknownMap } from "./ui/dead_ends.ts";
 import { listen, showKeys, type Key } from "./ui/keys.ts";
 import { logIn } from "./ui/login.ts";
+import { StillPictures } from "./ui/still_pictures.ts";
 import { copied } from "./ui/take_away_panel.ts";
 import { applyTheme, TopBar } from "./ui/top_bar.ts";
 
-const RETRY_MS = 3000;
 const api = new Api();
 let open: Console | null = null;
+/** Number of the newest start: an older one that still waits gives up. */
+let starts = 0;
 
-async function mapsOf(): Promise<MapInfo[]> {
+async function mapsOf(why: string): Promise<MapInfo[]> {
   for (;;) {
     try {
       return await api.json<MapInfo[]>("maps");
     } catch (error) {
       if (!(error instanceof ApiError)) throw error;
       if (error.wantsToken) {
-        await logIn(api, api.token ? error.message : "");
+        await logIn(api, api.token ? error.message : why);
         continue;
       }
       message("The server does not answer", error.message);
-      await new Promise((resolve) => setTimeout(resolve, RETRY_MS));
+      await pause();
     }
   }
 }
 
-function message(title: string, ...lines: string[]): void {
-  fill(document.body, h("main", { class: "message" }, h("h1", {}, title), ...lines.map((line) => h("p", {}, line))));
-}
-
-async function start(): Promise<void> {
+/** Open what the address names; `why` is said to whoever must log in again. */
+async function start(why = ""): Promise<void> {
+  const mine = ++starts;
   open?.dispose();
   open = null;
-  const maps = await mapsOf();
-  const { map, look, camera } = fromHash(location.hash);
-  const info = maps.find(({ name }) => name === map) ?? maps.toSorted((a, b) => b.size_bytes - a.size_bytes)[0];
-  if (!info) {
-    message("No map yet", "Make one: cairn map create URL NAME. This page shows it when you reload.");
-    return;
+  for (;;) {
+    const maps = await mapsOf(why);
+    if (mine !== starts) return;
+    const { map } = fromHash(location.hash);
+    const info = map === null ? maps.toSorted((a, b) => b.size_bytes - a.size_bytes)[0] : maps.find(({ name }) => name === map);
+    if (info) return show(maps, info);
+    if (map === null) noMap();
+    else unknownMap(map, maps);
+    await pause();
+    if (mine !== starts) return;
   }
+}
+
+function show(maps: MapInfo[], info: MapInfo): void {
+  const { look, camera } = fromHash(location.hash);
   fill(document.body);
   document.title = `${info.name} · cairn`;
-  const goTo = (name: string) => {
-    history.replaceState(null, "", `#map=${name}`);
-    void start();
-  };
-  const again = () => {
+  const again = (why: string) => {
     api.logOut();
-    void start();
+    void start(why);
   };
-  const bar = new TopBar(maps, info.name, api.token !== null, { map: goTo, keys: () => showKeys(keys), share, logOut: again });
+  const goTo = (name: string) => (location.hash = `map=${name}`);
+  const bar = new TopBar(maps, info.name, api.token !== null, { map: goTo, keys: () => showKeys(keys), share, logOut: () => again("") });
   document.body.append(bar.element);
-  open = new Console(api, info, look, camera, bar, again);
+  if (!hasWebGl()) return void document.body.append(new StillPictures(api, info).element);
+  const mine = starts;
+  // Many requests may be refused at once; the first one asks who is there.
+  const refused = () => mine === starts && again("You are logged out: this token ended, or was revoked. With another one the page goes on where it was.");
+  open = new Console(api, info, look, camera, bar, refused);
   if (new URLSearchParams(location.search).has("test")) Object.assign(window, { cairn: { api, console: open } });
 }
 
 function share(): void {
-  if (!open) return;
-  history.replaceState(null, "", open.address);
+  const address = open?.address ?? location.href;
+  history.replaceState(null, "", address);
   const close = h("button", { type: "button" }, "Close");
-  const dialog = h("dialog", { class: "share", "aria-label": "Share" }, h("h2", {}, "This very view"), copied(open.address), close);
+  const dialog = h("dialog", { class: "share", "aria-label": "Share" }, h("h2", {}, "This very view"), copied(address), close);
   close.addEventListener("click", () => dialog.close());
   dialog.addEventListener("close", () => dialog.remove());
   document.body.append(dialog);
@@ -77,19 +88,23 @@ const keys: Key[] = [
   ...FIELDS.map(({ field, label }, n) => ({ keys: [`Shift+${n + 1}`], what: `Colour by ${label.toLowerCase()}`, run: () => open?.setField(field) })),
   { keys: ["h", "f"], what: "All of the map", run: () => open?.camera.home() },
   { keys: ["t"], what: "From above", run: () => open?.camera.top() },
-  { keys: ["w"], what: "Inside, at a person's height", run: () => open?.camera.walk() },
+  { keys: ["w"], what: "Walk: inside, at a person's height; then a step ahead", run: () => open?.walk(0, 1) },
+  { keys: ["s"], what: "Who walks: a step back", run: () => open?.walk(0, -1) },
+  { keys: ["a"], what: "Who walks: a step to the left", run: () => open?.walk(-1, 0) },
+  { keys: ["d"], what: "Who walks: a step to the right", run: () => open?.walk(1, 0) },
   { keys: ["x"], what: "The hottest place shown", run: () => open?.camera.hottest() },
   { keys: NUMBERED, what: "Fly to the finding of that number", run: (key) => open?.findings.flyTo(Number(key)) },
   { keys: ["n"], what: "Mark: the next click names a place", run: () => open?.findings.startMarking() },
   { keys: ["["], what: "Ceiling down 10 cm", run: () => open?.step(false) },
   { keys: ["]"], what: "Ceiling up 10 cm", run: () => open?.step(true) },
+  { keys: ["c"], what: "Ceiling off or on", run: () => open?.toggleCeiling() },
   { keys: ["m"], what: "Measure: clicks set points", run: () => open?.measure.switch() },
   { keys: ["g"], what: "Borders of cells", run: () => open?.toggleGrid() },
   { keys: ["Enter", " "], what: "Ask what is in the middle of the picture", run: () => askMiddle() },
-  { keys: ["ArrowLeft"], what: "Turn left", run: () => open?.stage.turn(1, 0) },
-  { keys: ["ArrowRight"], what: "Turn right", run: () => open?.stage.turn(-1, 0) },
-  { keys: ["ArrowUp"], what: "Turn up", run: () => open?.stage.turn(0, -1) },
-  { keys: ["ArrowDown"], what: "Turn down", run: () => open?.stage.turn(0, 1) },
+  { keys: ["ArrowLeft"], what: "Turn left", run: () => open?.turn(-1, 0) },
+  { keys: ["ArrowRight"], what: "Turn right", run: () => open?.turn(1, 0) },
+  { keys: ["ArrowUp"], what: "Turn up", run: () => open?.turn(0, -1) },
+  { keys: ["ArrowDown"], what: "Turn down", run: () => open?.turn(0, 1) },
   { keys: ["+"], what: "Nearer", run: () => open?.stage.nearer(0.8) },
   { keys: ["-"], what: "Farther", run: () => open?.stage.nearer(1.25) },
   { keys: ["Escape"], what: "Follow nobody, ask of nothing", run: () => open?.forget() },
@@ -104,6 +119,10 @@ function askMiddle(): void {
 
 applyTheme();
 listen(keys);
-// A shared link that is opened where the page already is.
-window.addEventListener("hashchange", () => void start());
+// A shared link that is opened where the page already is, or Back after a flight.
+window.addEventListener("hashchange", () => {
+  const { map, look, camera } = fromHash(location.hash);
+  if (open && open.name === map && camera) open.take(look, camera);
+  else void start();
+});
 void start();

@@ -2,19 +2,23 @@
 
 import { ClampToEdgeWrapping, DataTexture, LinearFilter, RGBAFormat, UnsignedByteType } from "three";
 
-/** Stops at equal distances; matplotlib's (CC0), inferno without its black, which a dark ground would swallow. */
+/** Stops at equal distances; matplotlib's (CC0), inferno and cividis without their darkest, which a dark ground would swallow. */
 const STOPS = {
   inferno: [
     "220c4a", "4a0c6b", "781c6d", "a52c60", "cf4446", "ed6925", "fb9b06", "f7d13d", "fcffa4",
   ],
   cividis: [
-    "00224e", "123570", "3b496c", "575d6d", "707173", "8a8779", "a59c74", "c3b369", "e1cc55", "fee838",
+    "123570", "3b496c", "575d6d", "707173", "8a8779", "a59c74", "c3b369", "e1cc55", "fee838",
   ],
   viridis: [
     "440154", "482878", "3e4989", "31688e", "26828e", "1f9e89", "35b779", "6ece58", "b5de2b", "fde725",
   ],
 } as const;
 export type Palette = keyof typeof STOPS;
+
+/** Above the upper end of any palette, and below the lower one: in none of them, and unlike either ground. */
+export const OVER = "#ff6ad5";
+export const UNDER = "#2a3f86";
 
 function rgb(hex: string): number[] {
   return [0, 2, 4].map((at) => parseInt(hex.slice(at, at + 2), 16));

@@ -181,7 +181,8 @@ export class Team {
       mark = new RobotMark(robotColour(name, this.names));
       this.marks.set(name, mark);
       this.group.add(mark.group);
-      const label = h("span", { class: "label" }, name);
+      const dot = h("span", { class: "dot" });
+      const label = h("span", { class: "label" }, dot, name);
       this.labels.set(name, label);
       this.host.append(label);
     }
@@ -195,7 +196,9 @@ export class Team {
     const colour = robotColour(sign.branch, this.names);
     mark.setColours(offline ? OFFLINE_COLOUR : colour, colour);
     mark.update(sign);
-    this.labels.get(sign.branch)!.classList.toggle("offline", offline);
+    const label = this.labels.get(sign.branch)!;
+    label.classList.toggle("offline", offline);
+    (label.firstElementChild as HTMLElement).style.background = colour;
     if (this.followed === sign.branch && before && mark.position) {
       const step = mark.position.clone().sub(before);
       const { eye, target } = this.stage.view;

@@ -15,6 +15,7 @@ from cairn_map.render.render_request import RenderRequest
 from cairn_map.wire.change_messages import ChangesAnswer
 from cairn_map.wire.hot_spot_messages import SPOTS_MAX, VOXELS_MAX, HotSpotsAnswer
 from cairn_map.wire.hottest_messages import HOTTEST_MAX, HottestAnswer
+from cairn_map.wire.spread_messages import SpreadAnswer
 from cairn_server.access.connection_places import ConnectionPlace
 from cairn_server.http.middleware.deadlines import PLACE
 from cairn_server.http.routes.callers import READERS, Asking, Credentials, Map, Operations
@@ -117,6 +118,12 @@ def hot_spots(
 ) -> HotSpotsAnswer:
     """The hot spots: connected occupied voxels above a temperature, with place, size, height, who and when."""
     return service.views.hot_spots.asked(row, over_k=over_k, voxels_min=min_voxels, count=count, box=box)
+
+
+@router.get("/maps/{name}/main/spread", dependencies=READERS)
+def spread(service: Operations, row: Map) -> SpreadAnswer:
+    """Histograms of the heights and temperatures of all occupied voxels: the ends of a colour bar."""
+    return service.views.spread.asked(row)
 
 
 async def map_without_ticket(name: str, request: Request, asker: Asking) -> MapRow | None:

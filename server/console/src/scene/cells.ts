@@ -95,8 +95,15 @@ export class Cells {
   /** Cells of which what is shown is not what is wanted. */
   get waiting(): number {
     let sum = 0;
-    for (const shown of this.all.values()) if (shown.busy || shown.dirty || shown.isOff) sum++;
+    for (const shown of this.all.values()) if (shown.busy || (shown.wanted > 0 && (shown.dirty || shown.isOff))) sum++;
     return sum;
+  }
+
+  /** Cells that have no room in the picture, though something may be in them. */
+  get leftOut(): number {
+    let sum = 0;
+    for (const shown of this.all.values()) if (shown.wanted === 0 && !shown.isEmpty) sum++;
+    return this.planned ? sum : 0;
   }
 
   get bounds(): Box3 {
@@ -120,9 +127,9 @@ export class Cells {
     const cells = [...this.all.values()];
     const pxPerRad = heightPx / (2 * Math.tan((camera.fov * Math.PI) / 360));
     const candidates = cells.map((cell) => {
-      const distance = Math.max(cell.box.distanceToPoint(camera.position), 0.3);
-      const sizePx = frustum.intersectsBox(cell.box) ? (this.edgeM / distance) * pxPerRad : 0;
-      return { counts: cell.counts, depthMax: this.depthMax, sizePx, shown: cell.depth };
+      const distanceM = Math.max(cell.box.distanceToPoint(camera.position), 0.3);
+      const sizePx = frustum.intersectsBox(cell.box) ? (this.edgeM / distanceM) * pxPerRad : 0;
+      return { counts: cell.counts, depthMax: this.depthMax, sizePx, distanceM, shown: cell.depth };
     });
     const depths = plan(candidates, this.budget);
     cells.forEach((cell, n) => {
@@ -182,7 +189,7 @@ export class Cells {
       cell.counted(depth);
       cell.failedMs = NEVER_MS;
       this.error = null;
-      if (this.firstPictureMs === null && ![...this.all.values()].some(({ etag }) => etag === null)) {
+      if (this.firstPictureMs === null && ![...this.all.values()].some(({ etag, wanted }) => etag === null && wanted > 0)) {
         this.firstPictureMs = performance.now();
         isWhole = true;
       }

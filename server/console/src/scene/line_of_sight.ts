@@ -28,3 +28,23 @@ export function freeM(cells: Cells, from: Vector3, to: Vector3): number {
   }
   return free;
 }
+
+/** Whether nothing that is shown reaches into a box; m in the map. */
+export function isFree(cells: Cells, body: Box3): boolean {
+  const { uLow, uHigh, uMinP } = uniforms;
+  const shown = new Box3(uLow.value, uHigh.value);
+  const node = new Box3();
+  const centre = new Vector3();
+  for (const { bytes, depth, box } of cells.all.values()) {
+    if (!bytes.length || !box.intersectsBox(body)) continue;
+    const edgeM = cells.edgeM / 2 ** depth;
+    for (let at = 0; at < bytes.length; at += STRIDE) {
+      if (bytes[at + 3] / 255 < uMinP.value) continue;
+      centre.set(bytes[at] + 0.5, bytes[at + 1] + 0.5, bytes[at + 2] + 0.5).multiplyScalar(edgeM).add(box.min);
+      node.min.copy(centre).subScalar(edgeM / 2);
+      node.max.copy(centre).addScalar(edgeM / 2);
+      if (node.intersectsBox(body) && shown.containsPoint(centre)) return false;
+    }
+  }
+  return true;
+}

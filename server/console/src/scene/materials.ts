@@ -5,7 +5,7 @@
 
 import { DataTexture, DoubleSide, GLSL3, ShaderMaterial, Vector2, Vector3, Vector4, type IUniform } from "three";
 import { HEAT_STEP_K, HEAT_ZERO_K } from "../decode/pack.ts";
-import { textureOf } from "../palettes.ts";
+import { OVER, rgbOf, textureOf, UNDER } from "../palettes.ts";
 
 export const FIELD_CODES = { colour: 0, temperature: 1, probability: 2, height: 3, age: 4, robot: 5 } as const;
 /** A box spreads over at most this much of its edge in a picture: the diagonal, and some for perspective. */
@@ -14,6 +14,9 @@ const SPREAD = 1.9;
 export const uniforms = {
   uField: { value: 0 },
   uRange: { value: new Vector2(0, 1) },
+  /** Above and below the range. */
+  uOver: { value: new Vector3(...rgbOf(OVER)) },
+  uUnder: { value: new Vector3(...rgbOf(UNDER)) },
   uPalette: { value: textureOf("inferno") as DataTexture },
   uLow: { value: new Vector3(-1e9, -1e9, -1e9) },
   uHigh: { value: new Vector3(1e9, 1e9, 1e9) },
@@ -40,7 +43,7 @@ in vec4 colour;   // red, green, blue; flags in 1/255
 in vec4 heat;     // mean and hottest, in steps, two bytes each
 uniform int uField;
 uniform vec2 uRange, uBand;
-uniform vec3 uLow, uHigh, uBare, uFaded, uRobot;
+uniform vec3 uLow, uHigh, uBare, uFaded, uRobot, uOver, uUnder;
 uniform float uMinP, uPointMax, uAge, uFresh;
 uniform vec4 uViewport;
 uniform sampler2D uPalette;
@@ -53,7 +56,12 @@ flat out uint vVertex;
 flat out float vLight;
 const float GROWN = __GROWN__;
 
-vec3 shade(float x) { return texture(uPalette, vec2((clamp(x, 0.0, 1.0) * 255.0 + 0.5) / 256.0, 0.5)).rgb; }
+// Beyond the ends of the palette the colours of the legend's end blocks; what the ends' rounding leaves over is within.
+vec3 shade(float x) {
+  if (x > 1.004) return uOver;
+  if (x < -0.004) return uUnder;
+  return texture(uPalette, vec2((clamp(x, 0.0, 1.0) * 255.0 + 0.5) / 256.0, 0.5)).rgb;
+}
 
 void main() {
   vec4 world = modelMatrix * vec4(place.xyz + 0.5, 1.0);
@@ -95,6 +103,7 @@ void main() {
     vColour = uRobot.x < 0.0 ? uBare : uRobot * (0.45 + 0.55 * p);
     vBare = uRobot.x < 0.0 ? 1.0 : 0.0;
   } else vColour = shade(1.0 - (uAge - uRange.x) / span);
+  if (vColour == uOver || vColour == uUnder) vBare = 1.0; // flat, as the legend's blocks are
   if (uBand.x <= uBand.y && !(warm && hottest >= uBand.x && kelvin <= uBand.y)) {
     vColour = mix(uFaded, vColour, 0.12);
     vBare = 0.0;
@@ -115,18 +124,15 @@ flat in float vLight;
 uniform vec4 uViewport;
 uniform vec2 uNearFar;
 uniform uint uObject;
-`;
-
-const HATCH = `
-  if (vBare > 0.5 && mod(floor((gl_FragCoord.x + gl_FragCoord.y) / 3.0), 2.0) < 0.5) shown *= 0.82;
+// What has no value of the field is lit less by its faces: flat, so that it does not speak before what has one.
+const float QUIET = 0.5;
 `;
 
 const SQUARE = `${FRAGMENT_HEAD}
 out vec4 outColour;
 void main() {
-  vec3 shown = vColour * vLight;
-  ${HATCH}
-  outColour = vec4(shown, 1.0);
+  // Alpha tells the edge of the square to the shading by depth: scene/eye_dome.ts.
+  outColour = vec4(vColour * mix(vLight, 0.9, vBare * QUIET), (log2(2.0 * vHalf) + 8.0) / 12.0);
 }`;
 
 /** Where the pixel's ray meets the cube; `t` is the depth along the view's axis. */
@@ -147,9 +153,7 @@ void main() {
   ${CUT}
   vec3 lit = vec3(t == enter.x, t == enter.y, t == enter.z);
   float light = dot(lit, vec3(0.88, 0.74, ray.z < 0.0 ? 1.04 : 0.62)) / max(lit.x + lit.y + lit.z, 1.0);
-  vec3 shown = vColour * light;
-  ${HATCH}
-  outColour = vec4(shown, 1.0);
+  outColour = vec4(vColour * mix(light, 0.9, vBare * QUIET), 0.0);
 }`;
 
 const NUMBER = `${FRAGMENT_HEAD}

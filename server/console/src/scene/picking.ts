@@ -23,11 +23,16 @@ export interface Picked {
   readonly isVoxel: boolean;
 }
 
+const FORMAT = {
+  format: RGBAIntegerFormat, type: UnsignedIntType, internalFormat: "RGBA32UI", magFilter: NearestFilter,
+  minFilter: NearestFilter, generateMipmaps: false,
+} as const;
+/** Of the picture that boxes are measured in, px. */
+const WHOLE = { width: 96, height: 72 };
+
 export class Picker {
-  private readonly target = new WebGLRenderTarget(1, 1, {
-    format: RGBAIntegerFormat, type: UnsignedIntType, internalFormat: "RGBA32UI", magFilter: NearestFilter,
-    minFilter: NearestFilter, generateMipmaps: false,
-  });
+  private readonly target = new WebGLRenderTarget(1, 1, FORMAT);
+  private readonly whole = new WebGLRenderTarget(WHOLE.width, WHOLE.height, FORMAT);
   private readonly scene = new Scene();
   private readonly stage: Stage;
   private readonly cells: Cells;
@@ -39,38 +44,31 @@ export class Picker {
 
   /** What is drawn at a place of the canvas, px from its upper left corner; null: nothing. */
   at(x: number, y: number): Picked | null {
-    const { renderer, camera, canvas } = this.stage;
+    const { renderer, canvas } = this.stage;
     const ratio = renderer.getPixelRatio();
     const px = Math.floor(x * ratio);
     const py = canvas.height - 1 - Math.floor(y * ratio);
-    const { width, height } = canvas;
     // The target is one pixel of a picture that reaches beyond it, so points whose centres lie elsewhere count.
-    this.target.viewport.set(-px, -py, width, height);
+    this.target.viewport.set(-px, -py, canvas.width, canvas.height);
     this.target.scissor.set(0, 0, 1, 1);
-    uniforms.uViewport.value.set(-px, -py, width, height);
-    const parent = this.cells.group.parent as Object3D;
-    const material = this.cells.material;
-    this.cells.setMaterial(numbers);
-    this.scene.add(this.cells.group);
-    renderer.setRenderTarget(this.target);
-    renderer.clear();
-    renderer.render(this.scene, camera);
-    const read = new Uint32Array(4);
-    renderer.readRenderTargetPixels(this.target, 0, 0, 1, 1, read);
-    renderer.setRenderTarget(null);
-    parent.add(this.cells.group);
-    this.cells.setMaterial(material);
+    const read = this.read(this.target);
     if (!read[3] || !read[0]) return null;
     const depthM = new Float32Array(read.buffer)[2];
     return this.named(this.cells.byNumber[read[0] - 1], read[1], x, y, depthM);
   }
 
-  /** A box around what lies in the middle of the picture, 40 % of its sides, by 25 rays; null: nothing does. */
+  /** A box around all that is in the picture, looked at in a coarse one; null: nothing is. */
   boxInView(): Box3 | null {
+    const { width, height } = WHOLE;
     const { clientWidth, clientHeight } = this.stage.canvas;
+    const read = this.read(this.whole);
+    const depths = new Float32Array(read.buffer);
     const box = new Box3();
-    for (let n = 0; n < 25; n++) {
-      const picked = this.at(clientWidth * (0.3 + 0.1 * (n % 5)), clientHeight * (0.3 + 0.1 * Math.floor(n / 5)));
+    for (let n = 0; n < width * height; n++) {
+      if (!read[4 * n + 3] || !read[4 * n]) continue;
+      const [x, y] = [(n % width) + 0.5, height - Math.floor(n / width) - 0.5];
+      const cell = this.cells.byNumber[read[4 * n] - 1];
+      const picked = this.named(cell, read[4 * n + 1], (x / width) * clientWidth, (y / height) * clientHeight, depths[4 * n + 2]);
       if (picked) box.expandByPoint(picked.point);
     }
     return box.isEmpty() ? null : box.expandByScalar(0.2);
@@ -78,6 +76,27 @@ export class Picker {
 
   dispose(): void {
     this.target.dispose();
+    this.whole.dispose();
+  }
+
+  /** The picture once more, in a target, with numbers instead of colours. */
+  private read(target: WebGLRenderTarget): Uint32Array {
+    const { renderer, camera } = this.stage;
+    const { x, y, z, w } = target.viewport;
+    uniforms.uViewport.value.set(x, y, z, w);
+    const parent = this.cells.group.parent as Object3D;
+    const material = this.cells.material;
+    this.cells.setMaterial(numbers);
+    this.scene.add(this.cells.group);
+    renderer.setRenderTarget(target);
+    renderer.clear();
+    renderer.render(this.scene, camera);
+    const read = new Uint32Array(4 * target.width * target.height);
+    renderer.readRenderTargetPixels(target, 0, 0, target.width, target.height, read);
+    renderer.setRenderTarget(null);
+    parent.add(this.cells.group);
+    this.cells.setMaterial(material);
+    return read;
   }
 
   private named(cell: ShownCell, row: number, x: number, y: number, depthM: number): Picked | null {

@@ -4,29 +4,47 @@ import { Box3, Color, Frustum, Matrix4, PerspectiveCamera, Scene, Spherical, Vec
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 import type { CameraView } from "../look.ts";
 import type { Triple } from "../messages.ts";
+import { EyeDome } from "./eye_dome.ts";
 import { uniforms } from "./materials.ts";
 
 const FLIGHT_MS = 450;
 /** Of a drawing without a graphics card, whose frame takes 50 ms and more of all cores: cells come sooner without it. */
 const SOON_MS = 1000;
+/** After its last move the eye rests, ms. */
+const REST_MS = 200;
 const STEP_RAD = Math.PI / 30;
 /** Of the picture, by what is looked at. */
 const FILLED = 0.92;
+
+/** Whether this browser draws in three dimensions at all. */
+export function hasWebGl(): boolean {
+  const found = document.createElement("canvas").getContext("webgl2");
+  found?.getExtension("WEBGL_lose_context")?.loseContext();
+  return found !== null;
+}
 
 export class Stage {
   readonly renderer: WebGLRenderer;
   readonly camera = new PerspectiveCamera(55, 1, 0.05, 1000);
   readonly controls: OrbitControls;
-  readonly scene = new Scene();
+  /** Voxels, which are shaded by depth; and what is drawn over them as it is. */
+  readonly voxels = new Scene();
+  readonly overlays = new Scene();
+  readonly dome = new EyeDome();
   readonly isSoftware: boolean;
   readonly gpu: string;
   /** Called before a frame; whether another one follows. */
   onFrame: () => boolean = () => false;
   onMove: () => void = () => {};
+  /** Called before the eye is brought somewhere else. */
+  onFly: () => void = () => {};
   frames = 0;
   private readonly resizes: ResizeObserver;
   private asked = false;
   private later = 0;
+  private atRest = 0;
+  /** Until when the eye counts as moving, as of performance.now(). */
+  private restsMs = 0;
   private ready = false;
   private flight: { from: CameraView; to: CameraView; startMs: number } | null = null;
 
@@ -51,10 +69,7 @@ export class Stage {
     this.controls.screenSpacePanning = true;
     this.controls.maxDistance = 500;
     this.controls.minDistance = 0.2;
-    this.controls.addEventListener("change", () => {
-      this.onMove();
-      this.draw();
-    });
+    this.controls.addEventListener("change", () => this.moves());
     this.controls.addEventListener("start", () => (this.flight = null));
     this.resizes = new ResizeObserver(() => this.resize(host));
     this.resizes.observe(host);
@@ -65,15 +80,14 @@ export class Stage {
     return this.renderer.domElement;
   }
 
+  /** Lines and other things over the voxels. */
   add(...objects: Object3D[]): void {
-    this.scene.add(...objects);
+    this.overlays.add(...objects);
   }
 
   /** Have the shaders of what will be drawn compiled beside the page's own work; then draw. */
   async prepare(): Promise<void> {
-    const canWait = this.renderer.getContext().getExtension("KHR_parallel_shader_compile");
-    if (canWait) await this.renderer.compileAsync(this.scene, this.camera);
-    else this.renderer.compile(this.scene, this.camera);
+    await this.dome.compile(this.renderer, this.voxels, this.camera);
     this.ready = true;
     this.draw();
   }
@@ -105,6 +119,10 @@ export class Stage {
     return new Frustum().setFromProjectionMatrix(matrix);
   }
 
+  get isFlying(): boolean {
+    return this.flight !== null;
+  }
+
   get view(): CameraView {
     return { eye: this.camera.position.toArray() as Triple, target: this.controls.target.toArray() as Triple };
   }
@@ -114,12 +132,28 @@ export class Stage {
     this.camera.position.set(...eye);
     this.controls.target.set(...target);
     this.controls.update();
+    this.moves();
+  }
+
+  /** Without a graphics card the picture is shaded only once the eye rests: a half of a frame's time. */
+  get isMoving(): boolean {
+    return this.isSoftware && performance.now() < this.restsMs;
+  }
+
+  private drawAtRest(): void {
+    window.clearTimeout(this.atRest);
+    this.atRest = window.setTimeout(() => this.draw(), Math.max(this.restsMs - performance.now(), 0) + 1);
+  }
+
+  private moves(): void {
+    this.restsMs = performance.now() + REST_MS;
     this.onMove();
     this.draw();
   }
 
   /** Bring the eye somewhere, so that people see how they got there. */
   fly(to: CameraView): void {
+    this.onFly();
     if (matchMedia("(prefers-reduced-motion: reduce)").matches || this.isSoftware) return this.place(to);
     this.flight = { from: this.view, to, startMs: performance.now() };
     this.draw();
@@ -183,9 +217,11 @@ export class Stage {
   /** Let go of the graphics card: browsers keep few pictures of this kind. */
   dispose(): void {
     window.clearTimeout(this.later);
+    window.clearTimeout(this.atRest);
     this.ready = false;
     this.resizes.disconnect();
     this.controls.dispose();
+    this.dome.dispose();
     this.renderer.dispose();
     this.renderer.forceContextLoss();
   }
@@ -198,7 +234,8 @@ export class Stage {
     const { width, height } = this.canvas;
     uniforms.uViewport.value.set(0, 0, width, height);
     uniforms.uNearFar.value.set(this.camera.near, this.camera.far);
-    this.renderer.render(this.scene, this.camera);
+    this.dome.render(this.renderer, this.voxels, this.overlays, this.camera, !this.isMoving);
+    if (this.isMoving) this.drawAtRest();
     this.frames++;
     if (again || this.flight) this.draw();
   }

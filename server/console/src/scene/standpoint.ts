@@ -12,7 +12,7 @@ import type { Cells } from "./cells.ts";
 import type { ShownCell } from "./shown_cell.ts";
 
 /** Of a person's eyes over the floor, and of what is over their head; m. */
-const EYES_M = 1.6;
+export const EYES_M = 1.6;
 const ROOM_M = 1.8;
 /** A floor is told from a table by what else lies as high; and floors of other storeys are farther below than that; m. */
 const FLAT_M = 0.2;

@@ -23,6 +23,8 @@ export class CameraPanel {
   onHottest: (place: HotPlace | null) => void = () => {};
   onGo: () => void = () => {};
   onNoFloor: () => void = () => {};
+  /** The operator stands in the map. */
+  onWalk: () => void = () => {};
   private readonly stage: Stage;
   private readonly cells: Cells;
   private readonly team: Team;
@@ -65,8 +67,9 @@ export class CameraPanel {
   walk(): void {
     const target = new Vector3(...this.stage.view.target);
     const view = standing(this.cells, this.team.nearest(target) ?? target);
-    if (view) this.go(view);
-    else this.onNoFloor();
+    if (!view) return this.onNoFloor();
+    this.go(view);
+    this.onWalk();
   }
 
   /** Go to the hottest place that is shown. */

@@ -3,7 +3,7 @@
 import { fill, h } from "../dom.ts";
 import { KEPT } from "../log_book.ts";
 import { FIELDS, type Field, type Look } from "../look.ts";
-import { robotColour, stopsOf } from "../palettes.ts";
+import { OVER, robotColour, stopsOf, UNDER } from "../palettes.ts";
 import { thousands } from "../units.ts";
 
 /** What the log tells: the unit of ages, how much of the range's own it is, and how far back the log is known. */
@@ -14,19 +14,30 @@ export interface Told {
   readonly log: "whole" | "read" | "short";
 }
 
+/** Values of the whole map in the look's unit; `shift`: what is told as 0. */
+export interface Values {
+  readonly shift: number;
+  readonly histogram: { least: number; most: number; begin: number; step: number; counts: readonly number[] } | null;
+}
+
 const READING = "older entries of the log are being read";
 const FAR = `before the newest ${thousands(KEPT)} entries of the log`;
+const RAMP = { width: 240, height: 12 };
+/** Of the ramp, at each end that is open. */
+const BLOCK_PX = 12;
+const BARS = 48;
+const BARS_PX = 22;
 
 export class Legend {
-  readonly element = h("section", { class: "legend", "aria-label": "Legend" });
+  readonly element = h("section", { class: "legend", "aria-label": "Legend", tabindex: "0" });
   onRange: (range: [number, number] | null) => void = () => {};
   private shown = "";
   private locked = false;
 
   /** `range` in the look's unit; null: nothing that is shown has this field. */
-  show(look: Look, range: [number, number] | null, robots: readonly string[], told: Told): void {
+  show(look: Look, range: [number, number] | null, robots: readonly string[], told: Told, values: Values): void {
     const locked = look.ranges[look.field] !== undefined;
-    const state = JSON.stringify([look.field, range?.map((end) => end.toFixed(2)), locked, look.field === "robot" && robots, told]);
+    const state = JSON.stringify([look.field, range?.map((end) => end.toFixed(2)), locked, look.field === "robot" && robots, told, values]);
     const controls = () => [...this.element.querySelectorAll<HTMLElement>("input, button")];
     const focused = controls().indexOf(document.activeElement as HTMLElement);
     // Whoever types an end is not disturbed by one that follows what is shown.
@@ -36,38 +47,80 @@ export class Legend {
     if (state === this.shown || isPressed || (isTyping && locked === this.locked)) return;
     this.shown = state;
     this.locked = locked;
-    const { label, palette, unit: ofField } = FIELDS.find(({ field }) => field === look.field)!;
-    const isAge = look.field === "age";
-    const { unit, size } = isAge ? told : { unit: ofField, size: 1 };
-    const bare = h("p", { class: "bare" }, h("span", { class: "hatch", "aria-hidden": "true" }), bareText(look.field, told));
+    const { label, palette } = FIELDS.find(({ field }) => field === look.field)!;
+    const bare = h("p", { class: "bare" }, h("span", { class: "flat", "aria-hidden": "true" }), bareText(look.field, told));
     if (look.field === "robot") return fill(this.element, h("h2", {}, "Robot that added to the cell last"), ...robots.map((name) => named(name, robots)), bare);
     if (!palette) return fill(this.element, h("h2", {}, label), h("p", {}, "As the cameras saw it."), bare);
     if (!range) return fill(this.element, h("h2", {}, label), h("p", {}, `Nothing shown has a ${label.toLowerCase()}.`), bare);
-    const title = isAge ? `Age, ${unit} before the newest measurement` : `${label}${unit ? `, ${unit}` : ""}`;
-    const ends = range.map((end, n) =>
+    const isAge = look.field === "age";
+    fill(
+      this.element, h("h2", {}, titleOf(look.field, told, values)), values.histogram && bars(values.histogram, range, openEnds(look.field, range, values)),
+      bar(stopsOf(palette), openEnds(look.field, range, values), isAge), this.ends(look.field, range, told, values),
+      ...beyond(look.field, range, values), look.field === "temperature" ? bare : null,
+      isAge && told.log !== "whole" ? h("p", {}, told.log === "read" ? READING : `or older: changed ${FAR}`) : null,
+    );
+    controls()[focused]?.focus();
+  }
+
+  private ends(field: Field, range: [number, number], told: Told, { shift }: Values): HTMLElement {
+    const isAge = field === "age";
+    const { unit, size } = isAge ? told : { unit: FIELDS.find((one) => one.field === field)!.unit, size: 1 };
+    const digits = field === "probability" ? 2 : isAge && size === 1 ? 0 : 1;
+    const wrong = h("p", { class: "error", role: "alert" });
+    const take = () => {
+      const [low, high] = inputs.map((input) => size * input.valueAsNumber + shift);
+      wrong.textContent = low < high ? "" : "The lower end must be below the upper one.";
+      if (low < high) this.onRange([low, high]);
+    };
+    const inputs = range.map((end, n) =>
       h("input", {
-        type: "number", step: "any", value: rounded(end / size, look.field === "probability" ? 2 : isAge && size === 1 ? 0 : 1),
-        "aria-label": `${n ? "Upper" : "Lower"} end of the legend${unit ? `, ${unit}` : ""}`,
-        onchange: () => this.onRange(ends.map((input) => size * Number(input.value)) as [number, number]),
+        type: "number", step: "any", value: rounded((end - shift) / size, digits),
+        "aria-label": `${n ? "Upper" : "Lower"} end of the legend${unit ? `, ${unit}` : ""}`, onchange: take,
       }),
     );
     const lock = h(
       "button",
       {
-        type: "button", "aria-pressed": String(locked),
-        title: locked ? "Let the ends follow what is shown" : "Keep these ends",
-        onclick: () => this.onRange(locked ? null : range),
+        type: "button", "aria-pressed": String(this.locked),
+        title: this.locked ? "Let the ends follow the map" : "Keep these ends",
+        onclick: () => this.onRange(this.locked ? null : range),
       },
-      locked ? "Locked" : "Auto",
+      this.locked ? "Locked" : "Auto",
     );
-    fill(
-      this.element, h("h2", {}, title), bar(stopsOf(palette), isAge),
-      h("div", { class: "ends" }, ends[0], lock, ends[1]),
-      look.field === "temperature" ? bare : null,
-      isAge && told.log !== "whole" ? h("p", {}, told.log === "read" ? READING : `or older: changed ${FAR}`) : null,
-    );
-    controls()[focused]?.focus();
+    return h("div", {}, h("div", { class: "ends" }, inputs[0], lock, inputs[1]), wrong);
   }
+}
+
+function titleOf(field: Field, told: Told, { shift }: Values): string {
+  const { label, unit } = FIELDS.find((one) => one.field === field)!;
+  if (field === "age") return `Age, ${told.unit} before the newest measurement`;
+  if (field === "height" && shift) return `Height over the floor, ${unit}`;
+  return `${label}${unit ? `, ${unit}` : ""}`;
+}
+
+/** Whether something of the map lies below the lower end, and above the upper one. */
+function openEnds(field: Field, [low, high]: [number, number], { histogram }: Values): [boolean, boolean] {
+  if (field === "age") return [false, false];
+  return histogram ? [histogram.least < low, histogram.most > high] : [false, false];
+}
+
+/** What the end blocks stand for, in words. */
+function beyond(field: Field, range: [number, number], values: Values): HTMLElement[] {
+  const { shift, histogram } = values;
+  if (!histogram) return [];
+  const { unit } = FIELDS.find((one) => one.field === field)!;
+  const [isBelow, isAbove] = openEnds(field, range, values);
+  const said = (value: number) => `${rounded(value - shift, 1)} ${unit}`;
+  const [lowest, highest] = field === "temperature" ? ["coldest", "hottest"] : ["lowest", "highest"];
+  const line = (colour: string, text: string) => {
+    const block = h("span", { class: "flat", "aria-hidden": "true" });
+    block.style.background = colour;
+    return h("p", { class: "bare" }, block, text);
+  };
+  return [
+    ...(isAbove ? [line(OVER, `above ${said(range[1])}; ${highest} ${said(histogram.most)}`)] : []),
+    ...(isBelow ? [line(UNDER, `below ${said(range[0])}; ${lowest} ${said(histogram.least)}`)] : []),
+  ];
 }
 
 /** Never minus nothing. */
@@ -86,14 +139,46 @@ function named(name: string, robots: readonly string[]): HTMLElement {
   return h("p", {}, dot, ` ${name}`);
 }
 
-/** A canvas, because a strict page takes no gradient in an attribute. */
-function bar(stops: string[], reversed: boolean): HTMLCanvasElement {
-  const canvas = h("canvas", { width: 240, height: 12, class: "ramp", "aria-hidden": "true" });
+/** Where the palette begins and ends on the bar, px: between the blocks of ends that are open. */
+function innerPx(isBelow: boolean, isAbove: boolean): [number, number] {
+  return [isBelow ? BLOCK_PX : 0, RAMP.width - (isAbove ? BLOCK_PX : 0)];
+}
+
+/** A canvas, because a strict page takes no gradient in an attribute; ends beyond which the map goes on are blocks. */
+function bar(stops: string[], [isBelow, isAbove]: [boolean, boolean], reversed: boolean): HTMLCanvasElement {
+  const canvas = h("canvas", { ...RAMP, class: "ramp", "aria-hidden": "true" });
   const context = canvas.getContext("2d")!;
-  const gradient = context.createLinearGradient(0, 0, canvas.width, 0);
+  const [left, right] = innerPx(isBelow, isAbove);
+  const gradient = context.createLinearGradient(left, 0, right, 0);
   const order = reversed ? [...stops].reverse() : stops;
   order.forEach((stop, n) => gradient.addColorStop(n / (order.length - 1), stop));
-  context.fillStyle = gradient;
-  context.fillRect(0, 0, canvas.width, canvas.height);
+  const block = (colour: string | CanvasGradient, from: number, to: number) => {
+    context.fillStyle = colour;
+    context.fillRect(from, 0, to - from, RAMP.height);
+  };
+  block(UNDER, 0, left);
+  block(OVER, right, RAMP.width);
+  block(gradient, left, right);
+  return canvas;
+}
+
+/** How many voxels have which value: roots, so that the few hot ones are seen, too. */
+function bars({ begin, step, counts }: { begin: number; step: number; counts: readonly number[] }, [low, high]: [number, number], open: [boolean, boolean]): HTMLCanvasElement {
+  const canvas = h("canvas", { width: RAMP.width, height: BARS_PX, class: "bars", "aria-hidden": "true" });
+  const context = canvas.getContext("2d")!;
+  const sums = new Array<number>(BARS + 2).fill(0);
+  counts.forEach((count, n) => {
+    const place = Math.floor(((begin + (n + 0.5) * step - low) / (high - low)) * BARS);
+    sums[Math.min(Math.max(place, -1), BARS) + 1] += count;
+  });
+  const most = Math.max(...sums);
+  const [first, last] = innerPx(...open);
+  const wide = (last - first) / BARS;
+  context.fillStyle = getComputedStyle(document.documentElement).getPropertyValue("--quiet");
+  sums.forEach((sum, n) => {
+    const tall = Math.sqrt(sum / most) * BARS_PX;
+    const left = n === 0 ? 0 : first + (n - 1) * wide;
+    context.fillRect(left, BARS_PX - tall, n === 0 ? first : n > BARS ? RAMP.width - last : wide, tall);
+  });
   return canvas;
 }

@@ -71,7 +71,7 @@ export class TakeAwayPanel {
     const words = [
       asked.box ? "in the box" : "", asked.floor_m !== undefined ? `from ${metres(asked.floor_m)}` : "",
       asked.ceiling_m !== undefined ? `to ${metres(asked.ceiling_m)}` : "", asked.p ? `p at least ${asked.p}` : "",
-      this.look.band ? `${this.look.band[0]} to ${this.look.band[1]} °C` : "",
+      this.look.band ? bandText(this.look.band) : "",
     ].filter(Boolean);
     this.parts.textContent = words.length ? `Occupied, ${words.join(", ")}.` : "All that is occupied.";
     const { name } = this.info;
@@ -98,7 +98,7 @@ export class TakeAwayPanel {
     return {
       ...(clip ? { box: clip.flat().join(",") } : {}),
       ...(floorM !== null ? { floor_m: floorM } : {}), ...(ceilingM !== null ? { ceiling_m: ceilingM } : {}),
-      ...(minP > 0 ? { p: minP } : {}), ...(band ? { hotter_k: kelvin(band[0]), colder_k: kelvin(band[1]) } : {}),
+      ...(minP > 0 ? { p: minP } : {}), ...(band ? { hotter_k: kelvin(band[0]) } : {}), ...(band && band[1] !== null ? { colder_k: kelvin(band[1]) } : {}),
       ...(depth < this.info.geometry.depth ? { depth } : {}),
     };
   }
@@ -159,4 +159,8 @@ export function copied(text: string): HTMLElement {
     window.setTimeout(() => (button.textContent = "Copy"), 2000);
   });
   return h("div", { class: "copied" }, shown, button);
+}
+
+function bandText([from, to]: [number, number | null]): string {
+  return to === null ? `${from} °C and more` : `${from} to ${to} °C`;
 }

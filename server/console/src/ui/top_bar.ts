@@ -51,7 +51,7 @@ export class TopBar {
       error !== null && live ? ["late", `Trouble: ${error}`]
       : live && !isClockTrusted() ? ["late", "Live; the server's clock is not trusted: measurements may wait"]
       : live ? (waiting > 0 ? ["busy", `Live, loading ${waiting} cells`] : ["live", "Live"])
-      : age === null ? ["lost", "Connecting …"]
+      : age === null ? ["busy", "Connecting …"]
       : ["lost", `No link: the map is as it was ${ago(age)}`];
     if (this.link.dataset.state === state && this.link.textContent === said) return;
     this.link.dataset.state = state;

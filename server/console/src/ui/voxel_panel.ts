@@ -54,22 +54,29 @@ export class VoxelPanel {
     fill(this.element, h("h2", {}, "Voxel"), h("p", { class: "hint" }, "Click the map to ask what is there."));
   }
 
-  async show(picked: Picked, depthMax: number): Promise<void> {
+  /** `floorM`: what heights are told over, m in the map. */
+  async show(picked: Picked, depthMax: number, floorM: number | null): Promise<void> {
     const mine = ++this.asked;
     if (!picked.isVoxel) {
-      fill(this.element, h("h2", {}, "Voxel"), coarse(picked), h("p", { class: "hint" }, "Go closer to ask of a voxel."));
+      fill(this.element, h("h2", {}, "Voxel"), coarse(picked, floorM), h("p", { class: "hint" }, `The hottest in a block ${metres(picked.edgeM)} wide: come closer to ask of one voxel, and who saw it.`));
       return;
     }
     const side = 2 ** depthMax;
     const voxel = picked.node.map((place, axis) => place + picked.cell.cell[axis] * side) as Triple;
-    fill(this.element, h("h2", {}, "Voxel"), coarse(picked), h("p", { class: "hint" }, "Asking the server …"));
+    fill(this.element, h("h2", {}, "Voxel"), coarse(picked, floorM), h("p", { class: "hint" }, "Asking the server …"));
     try {
       const answer = await this.api.json<VoxelAnswer>(`maps/${this.map}/main/voxels/${voxel.join(",")}`);
-      if (mine === this.asked) fill(this.element, h("h2", {}, "Voxel"), exact(answer), whence(answer, this.robotAt(answer.lm)));
+      if (mine === this.asked) fill(this.element, h("h2", {}, "Voxel"), reading(answer, floorM), exact(answer), whence(answer, this.robotAt(answer.lm)));
     } catch (error) {
-      if (mine === this.asked) fill(this.element, h("h2", {}, "Voxel"), coarse(picked), h("p", { class: "error" }, (error as Error).message));
+      if (mine === this.asked) fill(this.element, h("h2", {}, "Voxel"), coarse(picked, floorM), h("p", { class: "error" }, (error as Error).message));
     }
   }
+}
+
+/** The reading first, as one tells it to another. */
+function headline(kelvin: number | null, rgb: number[] | null, z: number, floorM: number | null): HTMLElement {
+  const heat = kelvin === null ? "No temperature" : celsius(kelvin);
+  return h("p", { class: "reading" }, h("strong", {}, heat), rgb && swatch(rgb), floorM !== null && `${metres(z - floorM, 1)} over the floor`);
 }
 
 function swatch(rgb: number[]): HTMLElement {
@@ -78,16 +85,23 @@ function swatch(rgb: number[]): HTMLElement {
   return found;
 }
 
-function coarse({ cell, row, centre, edgeM, node, depth }: Picked): HTMLElement {
+/** The reading of what was clicked, whatever its size, and the numbers behind it. */
+function coarse({ cell, row, centre, edgeM, node, depth }: Picked, floorM: number | null): HTMLElement {
   const { probability, rgb, meanK, hottestK } = readingOf(cell, row);
-  return facts([
-    ["cell", cell.key],
-    ["node", `${node.join(",")} at depth ${depth}, ${metres(edgeM)} wide`],
-    ["centre", centre.toArray().map((value) => value.toFixed(2)).join(", ") + " m"],
-    ["probability", `${probability.toFixed(2)} (its highest voxel)`],
+  const numbers = facts([
     ["colour", rgb ? h("span", {}, swatch(rgb), ` ${rgb.join(", ")}`) : "none measured"],
     ["temperature", meanK === null ? "none measured" : `${celsius(meanK)} mean, ${celsius(hottestK!)} hottest`],
+    ["probability", `${probability.toFixed(2)} (its highest voxel)`],
+    ["centre", centre.toArray().map((value) => value.toFixed(2)).join(", ") + " m"],
+    ["cell", cell.key],
+    ["node", `${node.join(",")} at depth ${depth}, ${metres(edgeM)} wide`],
   ]);
+  return h("div", {}, headline(hottestK, rgb, centre.z, floorM), numbers);
+}
+
+function reading({ channels, centre_m }: VoxelAnswer, floorM: number | null): HTMLElement {
+  const of = (kind: Channel["kind"]) => channels.find((channel) => channel.kind === kind && channel.weight > 0)?.mean ?? null;
+  return headline(of("temperature")?.[0] ?? null, of("colour"), centre_m[2], floorM);
 }
 
 function exact(answer: VoxelAnswer): HTMLElement {
