@@ -159,11 +159,6 @@ export class Stage {
     this.draw();
   }
 
-  /** The eye is on its way. */
-  get isFlying(): boolean {
-    return this.flight !== null;
-  }
-
   /** Look at boxes from a side, as near as all their corners are seen: `direction` from them to the eye. */
   lookAt(boxes: readonly Box3[], direction: Vector3): CameraView {
     const back = direction.clone().normalize();
