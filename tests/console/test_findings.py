@@ -206,7 +206,7 @@ def test_findings_leave_as_a_table_and_as_geojson_in_the_maps_frame(desk: Consol
     with room.api as api:
         text = MarkText(kind="door", name="=1+1", place_m=(1.0, 0.5, 1.25), note='two "lines"\nof it')
         api.put_mark(FURNACE, MarkRequest(mark=text))
-    desk.until("c.findings.marks.all.length === 1", "the mark is here")
+    desk.until(f"c.findings.all.length === {len(SPOTS) + 1}", "the mark is here")
     files = {}
     for name in ("CSV", "GeoJSON"):
         with desk.page.expect_download() as coming:

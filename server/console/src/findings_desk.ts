@@ -196,9 +196,10 @@ export class FindingsDesk {
     try {
       if (act === "mark" && spot) this.ask("Mark this hot spot", markOfSpot(spot), entry?.key ?? null);
       else if (act === "edit" && entry) {
-        const { kind, name, place_mm, extent_mm, note } = entry.mark;
+        const { kind, name, place_mm, extent_mm, note, attachment } = entry.mark;
         const metres = (each: Triple) => each.map((value) => value / 1000) as Triple;
-        this.ask("Edit this mark", { kind, name, note: note ?? "", place_m: metres(place_mm), extent_m: metres(extent_mm ?? [0, 0, 0]) }, entry.key);
+        const text = { kind, name, note: note ?? "", place_m: metres(place_mm), extent_m: metres(extent_mm ?? [0, 0, 0]) };
+        this.ask("Edit this mark", attachment ? { ...text, attachment } : text, entry.key);
       } else if (act === "remove" && entry) await this.marks.remove(entry.key);
       else if (act === "again" && spot) for (const { key } of wordsAround(spot, this.marks.all)) await this.marks.remove(key);
       else if ((act === "seen" || act === "dismiss") && spot) await this.marks.put(wordOf(spot, act === "seen" ? SEEN : DISMISSED), entry?.key ?? null);

@@ -181,6 +181,8 @@ export interface Mark {
   note?: string;
   time_ms: number;
   by?: string;
+  /** Size and digest of a file, which the page passes on as it is. */
+  attachment?: unknown;
 }
 
 export interface MarkEntry {
@@ -205,4 +207,5 @@ export interface MarkText {
   place_m: Triple;
   extent_m?: Triple;
   note?: string;
+  attachment?: unknown;
 }
