@@ -66,7 +66,7 @@ export class FindingsDesk {
     const overC = Number(localStorage.getItem(THRESHOLD_KEY) ?? WARM_C);
     this.panel = new FindingsPanel(overC, this.alarm.element);
     this.pins = new Pins(this.stage);
-    this.marks = new MarkBook(api, info.name);
+    this.marks = new MarkBook(api, info.name.split(".")[0]!); // marks are the map's, also where one of its layers is shown
     this.spots = new HotSpotList(api, info.name, overC);
     this.marks.onChange = this.spots.onChange = () => this.update();
     this.panel.onFly = this.pins.onChoose = this.alarm.onFly = (id) => this.fly(id);
@@ -161,6 +161,7 @@ export class FindingsDesk {
     if (hidden) {
       // What was cut off for a better view hides what is looked for.
       this.look.floorM = this.look.ceilingM = this.look.clip = null;
+      this.look.isCeilingChosen = true; // else roofs are cut off again by themselves
       this.acts.look();
     }
     const from = found.spot?.commit ? this.acts.witness(found.spot.commit) : null;

@@ -91,5 +91,5 @@ export function fromHash(hash: string): { map: string | null; look: Look; camera
   const eye = numbers("eye", 3) as Triple | null;
   const target = numbers("target", 3) as Triple | null;
   const map = given.get("map") ?? null;
-  return { map: map && /^[a-z0-9][a-z0-9_-]{0,31}$/.test(map) ? map : null, look, camera: eye && target && { eye, target } };
+  return { map: map && /^[a-z0-9][a-z0-9_-]{0,31}(\.[a-z][a-z0-9_]{0,31})?$/.test(map) ? map : null, look, camera: eye && target && { eye, target } };
 }
