@@ -71,6 +71,7 @@ def test_only_what_is_within_the_band_keeps_its_colour(console: Console, room: R
     voxels = occupied(room)
     kelvin_of = dict(zip(map(tuple, voxels.numbers.tolist()), voxels.temperature_k, strict=True))
     page.get_by_label("Cubes").check()  # a pixel shows just what is picked there
+    console.tell("c.findings.pins.element.style.display = 'none'")
     page.get_by_label("Cell borders").uncheck()
     page.get_by_label("Ceiling").fill("120")
     page.locator(".host canvas").focus()
@@ -98,6 +99,7 @@ def test_only_what_is_within_the_band_keeps_its_colour(console: Console, room: R
     page.get_by_label("Only").uncheck()
     console.settled()
     assert (colours_at(console, places) == before).all()
+    console.tell("c.findings.pins.element.style.display = ''")
     page.get_by_label("Ceiling").fill("200")
 
 
