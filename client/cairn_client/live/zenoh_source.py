@@ -4,7 +4,7 @@
 
 Publishers announce themselves by liveliness tokens (`zenoh_keys`); a topic is subscribed as soon as there is one, once
 for all its publishers. Messages that publishers keep for those who come late, as of /tf_static, are asked for. zenoh
-calls back in threads of its own, which only put into the inbox; it also makes lost links again.
+calls back in the thread that reads its link, which only puts into the inbox; it also makes lost links again.
 """
 
 import logging
@@ -16,7 +16,7 @@ from collections.abc import Callable
 from typing import Any
 
 import zenoh
-from zenoh import ext
+from zenoh import ext, handlers
 
 from cairn_client.http.bridge_link import url_parts
 from cairn_client.live.inbox import Inbox
@@ -182,10 +182,13 @@ class ZenohSource:
                 self._count_missed(topic, sample.attachment)
                 self._inbox.receive(topic, bytes(sample.payload))
 
+        # In zenoh's own thread: with a thread for each topic, messages of two topics come in another order than they were
+        # sent, and a scan goes on without the image that was sent before the next one.
+        handler = handlers.Callback(take, indirect=False)
         if not (publisher.is_latched or STATIC_NAME in topic):
-            return self._session.declare_subscriber(publisher.key, take)
+            return self._session.declare_subscriber(publisher.key, handler)
         history = ext.HistoryConfig(detect_late_publishers=True, max_samples=LATCHED_MAX)
-        return ext.declare_advanced_subscriber(self._session, publisher.key, take, history=history)
+        return ext.declare_advanced_subscriber(self._session, publisher.key, handler, history=history)
 
     def _count_missed(self, topic: str, attachment: "zenoh.ZBytes | None") -> None:
         """Count the messages between the last number of a publisher and this one."""

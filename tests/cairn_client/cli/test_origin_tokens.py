@@ -50,6 +50,7 @@ def test_another_servers_url_gets_no_token_unless_it_has_one_of_its_own(
         "diff": [("diff", own, its), ("diff", copy, own, "--token", f"{other.url}=x"), ("diff", copy)],
         "relay": [("relay", own, its), ("relay", its, tmp_path / "bag", "--token-there", "x")],
         "map copy": [("map", "copy", own, its)],
+        "map publish": [("map", "publish", own, "--through", other.url.replace("http", "ws"))],
         "doctor": [("doctor", own, other.url)],
     }
     assert found.keys() == commands_with_two_places()
@@ -58,6 +59,7 @@ def test_another_servers_url_gets_no_token_unless_it_has_one_of_its_own(
         assert f"no token for {other.url}" in said, said
         assert f"--token {other.url}=TOKEN" in said, said
     cairn(*found["doctor"][0], folder=tmp_path, code=1)  # it names the address, and sends it no token either
+    cairn(*found["map publish"][0], folder=tmp_path, code=1)  # a bridge has no tokens
     assert other.shown
     assert set(other.shown) == {None}
     for command in found["diff"][1:]:

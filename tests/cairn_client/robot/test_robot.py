@@ -370,7 +370,7 @@ def test_a_store_of_a_newer_version_is_refused(tmp_path: Path) -> None:
      "http:///maps/lab", "http://base/maps/LAB", "http://base/lab"],
 )  # fmt: skip
 def test_a_bad_url_is_refused_with_the_right_form(tmp_path: Path, url: str) -> None:
-    with pytest.raises(BadInputError, match=r"http://HOST:PORT/maps/NAME|a name is"):
+    with pytest.raises(BadInputError, match=r"http://HOST:PORT/maps/NAME|a map's name is"):
         robot_in(tmp_path, url)
 
 

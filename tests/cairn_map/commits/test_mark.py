@@ -124,7 +124,7 @@ def test_a_commit_with_marks_is_of_any_map_of_its_grid() -> None:
         (with_meta(EPOCH_VERSION), "bad_commit"),
         (with_meta(marks=None), "bad_commit"),
         (with_meta(marks=[]), "bad_commit"),
-        (with_meta(4), "unknown_version"),
+        (with_meta(5), "unknown_version"),
         (with_meta(geometry=None, layers=json.loads(epoch_commit().text)["layers"]), "bad_commit"),
         (with_meta(epoch=3), "bad_commit"),
         (with_meta(marks=[json.loads(mark().to_json())] * (MARKS_MAX + 1)), "too_many_marks"),

@@ -32,7 +32,7 @@ def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
 def test_an_open_server_lets_everybody_without_a_token_do_everything(live: Live, route: tuple[str, str]) -> None:
     method, path = route
     place = {"branch": "mole", "commit": "x", "cell": "0,0,0", "voxel": "0,0,0", "token": "nobody", "file": "x.js"}
-    place |= {"author": str(MOLE), "robot": "mole"}
+    place |= {"author": str(MOLE), "robot": "mole", "sha": "0" * 64}
     answer = live.ask(method, path.format(name=live.new_map().name, **place), content=b"{}")
     assert answer.status_code not in (401, 403)
 
