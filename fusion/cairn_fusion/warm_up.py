@@ -9,6 +9,7 @@ from cairn_calib.rig.camera import camera_from_field_of_view
 from cairn_calib.rig.rig import Rig, Spectrum, mount_camera
 from cairn_fusion.clouds.lzf_kernels import decompress_into
 from cairn_fusion.mapping.integrate import Integrator, Method, integrate_scan, integrate_scans
+from cairn_fusion.mapping.ray_casting import carried
 from cairn_fusion.recording.scan import Scan
 from cairn_fusion.transfer.covariance_grid import CovarianceGrid
 from cairn_map.evidence.evidence_map import EvidenceMap
@@ -41,6 +42,7 @@ def warm_up() -> None:
     )
     integrate_scans([scan, scan], rig, Geometry(), integrator=Integrator(), threads=2)
     integrate_scan(scan, rig, Geometry(), integrator=Integrator(method=Method.CAST))
+    carried(np.zeros((1, 3)), np.eye(4))  # points of a sweep
     decompress_into(np.zeros(2, np.uint8), np.zeros(1, np.uint8))
     covariance = CovarianceGrid.of(rig, src="tof", dst="colour")
     covariance.at(np.zeros((1, 2)), np.ones(1, np.float32), np.ones(1, np.float32))
