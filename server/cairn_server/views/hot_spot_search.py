@@ -204,22 +204,28 @@ class _Search:
         def make() -> CellPieces:
             self.read += 1
             with DECODING.of_cell(row.geometry, self.listed[key].voxels):
-                return pieces_of_cell(key, self._evidence(key), row.geometry, row.sensor_model, self.over_k)
+                # A damaged cell is rebuilt from the log.
+                try:
+                    surfaces = stored_surface_reading(self._stored(key), row)
+                except DamagedDataError:
+                    surfaces = stored_surface_reading(self._rebuilt(key), row)
+                return pieces_of_cell(key, surfaces, row.geometry, row.sensor_model, self.over_k)
 
         return self.pieces.get(name, make)
 
-    def _evidence(self, key: CellKey) -> Evidence:
-        """Surfaces of a listed cell; one that is damaged is rebuilt from the log."""
+    def _stored(self, key: CellKey) -> CellRow:
+        """A listed cell as it is at rest."""
         stored = row_of_cell(self.snapshot, key)
         if stored is None:
             raise DamagedCellError(key, "a cell is listed, but is not there")
-        try:
-            return stored_surface_reading(stored, self.row)
-        except DamagedDataError:
-            rebuilt = sound_cell(self.snapshot, key, self.row.layer, self.faults.healed)
-            if rebuilt is None:
-                raise
-            return stored_surface_reading(rebuilt, self.row)
+        return stored
+
+    def _rebuilt(self, key: CellKey) -> CellRow:
+        """A damaged cell, made again from the log."""
+        rebuilt = sound_cell(self.snapshot, key, self.row.layer, self.faults.healed)
+        if rebuilt is None:
+            raise DamagedCellError(key, "a cell is listed, but is not there")
+        return rebuilt
 
     def _heights(self, spots: Spots) -> list[float | None]:
         """Height of each spot's hottest voxel over the floor."""

@@ -526,6 +526,7 @@ def test_objects_are_a_database_s(tmp_path: Path) -> None:
 
 
 def test_pushes_are_refused_before_the_database_is_full(database: Database, caplog: pytest.LogCaptureFixture) -> None:
+    PgStore(database.url).close()  # with the tables, which take a part of it
     ((size_bytes,),) = database.execute("SELECT pg_database_size(current_database())")
     used = int(str(size_bytes))
     with closing(PgStore(database.url, size_bytes_max=2 * used)) as store:
