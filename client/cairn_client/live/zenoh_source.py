@@ -16,7 +16,7 @@ from collections.abc import Callable
 from typing import Any
 
 import zenoh
-from zenoh import ext, handlers
+from zenoh import ext
 
 from cairn_client.http.bridge_link import url_parts
 from cairn_client.live.inbox import Inbox
@@ -182,9 +182,9 @@ class ZenohSource:
                 self._count_missed(topic, sample.attachment)
                 self._inbox.receive(topic, bytes(sample.payload))
 
-        # In zenoh's own thread: with a thread for each topic, messages of two topics come in another order than they were
-        # sent, and a scan goes on without the image that was sent before the next one.
-        handler = handlers.Callback(take, indirect=False)
+        # In zenoh's own thread: with a thread for each topic, messages of two topics come in another order than they
+        # were sent, and a scan goes on without the image that was sent before the next one.
+        handler = zenoh.handlers.Callback(take, indirect=False)
         if not (publisher.is_latched or STATIC_NAME in topic):
             return self._session.declare_subscriber(publisher.key, handler)
         history = ext.HistoryConfig(detect_late_publishers=True, max_samples=LATCHED_MAX)

@@ -167,6 +167,11 @@ export class Console {
     this.apply();
   }
 
+  /** True if this address is the one that is kept. */
+  isAt(address: string): boolean {
+    return this.kept.isAt(address);
+  }
+
   dispose(): void {
     window.clearInterval(this.timer);
     this.link.close();

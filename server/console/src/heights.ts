@@ -45,7 +45,8 @@ export class Heights {
   tick(): void {
     const { drawn, head, firstPictureMs } = this.cells;
     const isEarly = firstPictureMs === null;
-    const state = isEarly ? `${drawn} nodes` : `entry ${head}`;
+    // Once more when all of an entry is there: the first picture may lack a storey.
+    const state = isEarly ? `${drawn} nodes` : `entry ${head}, ${this.cells.isFetching ? "a part" : "whole"}`;
     if (state === this.foundIn || (!isEarly && performance.now() < this.nextMs)) return;
     this.foundIn = state;
     this.nextMs = performance.now() + FLOORS_MS;

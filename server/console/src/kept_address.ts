@@ -18,6 +18,10 @@ export class KeptAddress {
     if (isResting && isSame && address !== this.kept) this.keep(address);
   }
 
+  isAt(address: string): boolean {
+    return address === this.kept;
+  }
+
   /** Another address was followed: it is kept. */
   followed(): void {
     this.kept = this.now();

@@ -120,9 +120,14 @@ function askMiddle(): void {
 applyTheme();
 listen(keys);
 // A shared link that is opened where the page already is, or Back after a flight.
-window.addEventListener("hashchange", () => {
+function follow(): void {
   const { map, look, camera } = fromHash(location.hash);
   if (open && open.name === map && camera) open.take(look, camera);
   else void start();
+}
+window.addEventListener("hashchange", follow);
+// Back right after a flight leads to the address that is still kept, which is no change of it.
+window.addEventListener("popstate", () => {
+  if (open?.isAt(location.href)) follow();
 });
 void start();
