@@ -254,7 +254,7 @@ def test_a_storey_is_shown_alone(chromium: Browser, room: Room, voxels: Occupied
         tower.open(f"#map={TOWER}")
         tower.log_in()
         tower.settled()
-        tower.until("c.heights.storeys.floorsM.length === 2", "both floors are found: they are looked for every 2 s")
+        tower.until("c.heights.storeys.floorsM.length === 2", "both floors are found")
         assert tower.tell("c.heights.storeys.floorsM") == pytest.approx([floor, floor + rise_m])
         assert floor + rise_m + 1.2 <= tower.tell("c.look.ceilingM") <= floor + rise_m + CUT_M + 0.001
         tower.page.get_by_role("button", name="Lowest").click()

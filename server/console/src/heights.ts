@@ -45,11 +45,11 @@ export class Heights {
   tick(): void {
     const { drawn, head, firstPictureMs } = this.cells;
     const isEarly = firstPictureMs === null;
-    // Once more when all of an entry is there: the first picture may lack a storey.
-    const state = isEarly ? `${drawn} nodes` : `entry ${head}, ${this.cells.isFetching ? "a part" : "whole"}`;
+    const state = isEarly ? `${drawn} nodes` : `entry ${head}`;
     if (state === this.foundIn || (!isEarly && performance.now() < this.nextMs)) return;
     this.foundIn = state;
-    this.nextMs = performance.now() + FLOORS_MS;
+    // What is there early may lack a storey: the first look at all of it does not wait.
+    this.nextMs = isEarly ? 0 : performance.now() + FLOORS_MS;
     this.storeys = storeysOf(this.cells, this.spread.of("height"));
     this.onFloors();
     this.cutByItself();
