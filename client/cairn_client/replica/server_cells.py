@@ -226,9 +226,12 @@ class ServerCells:
         moved = [key for key in keys if not self._stands_at(key, to, coverage)]
         if not moved:
             return
+        # At rest, cells that stand together have no coverage of their own to keep.
+        together = [key for key in moved if coverage is None and self.cells.is_together(key)]
         with self._view_of(self._outbox.cells_in_doubt.intersection(moved)):
             with self._store.transaction():
                 self._store.move_cells(moved, to=to, coverage=coverage)
+                self._store.move_cells(together, to=to, coverage=self.cells.coverage)
             for key in moved:
                 self.cells.place(key, cursor=to, coverage=coverage)
 

@@ -33,6 +33,8 @@ WAITING_BYTES_MAX = 512 << 20
 """Largest size of unpacked chunks that overlap in time: a message that waits keeps its chunk in memory."""
 RECORDS_MAX = 1_000_000
 """Largest number of records in a chunk, and of messages that wait; chunks of 1 MB have some thousand."""
+LOG_NS_MAX = 2**63 - 1
+"""Latest time of a message, ns since 1970: the year 2262."""
 Record = TypeVar("Record")
 
 
@@ -179,6 +181,8 @@ class McapBag:
                 raise EOFError("a chunk ends within a record")
             if kind == MESSAGE:
                 channel, _, log_ns, _ = MESSAGE_HEAD.unpack_from(data, at)
+                if log_ns > LOG_NS_MAX:
+                    raise ValueError(f"a message is of {log_ns} ns, later than any clock has")
                 if channel in ids and log_ns >= start_ns:
                     yield BagMessage(self._topic_of[channel], log_ns, data[at + MESSAGE_HEAD.size : at + size])
             at += size

@@ -46,11 +46,11 @@ class Turns:
         Raises:
             UnreachableError: kind `busy`: it did not come in time; kind `shutting_down`.
         """
-        if self._is_closed:
-            raise _closed()
         if self._may_take(caller) and caller not in self._waiting:
             self._of[caller] += 1
             return
+        if self._is_closed:
+            raise _closed()
         mine = asyncio.get_running_loop().create_future()
         self._waiting.setdefault(caller, deque()).append(mine)
         try:
@@ -66,7 +66,7 @@ class Turns:
             raise UnreachableError("busy", message, retry_after_s=2.0) from None
 
     def close(self) -> None:
-        """Refuse all that wait, and all that come; those at work go on."""
+        """Refuse all that wait, and all that would have to; those at work go on."""
         self._is_closed = True
         waiting, self._waiting = self._waiting, OrderedDict()
         for mine in chain.from_iterable(waiting.values()):

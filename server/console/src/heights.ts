@@ -23,6 +23,8 @@ export class Heights {
   /** What the floors were found in, and when to look again, as of performance.now(). */
   private foundIn = "";
   private nextMs = 0;
+  /** The newest entry of which all that is wanted was there once. */
+  private wholeHead = -1;
 
   constructor(look: Look, cells: Cells, spread: Spread) {
     this.look = look;
@@ -45,7 +47,9 @@ export class Heights {
   tick(): void {
     const { drawn, head, firstPictureMs } = this.cells;
     const isEarly = firstPictureMs === null;
-    const state = isEarly ? `${drawn} nodes` : `entry ${head}`;
+    // Once more when all of an entry is there, and not again for each finer node: coarse ones may hide a storey.
+    if (!isEarly && !this.cells.isFetching && !this.cells.waiting && !this.cells.needsPlan) this.wholeHead = head;
+    const state = isEarly ? `${drawn} nodes` : `entry ${head}, ${this.wholeHead === head ? "whole" : "a part"}`;
     if (state === this.foundIn || (!isEarly && performance.now() < this.nextMs)) return;
     this.foundIn = state;
     // What is there early may lack a storey: the first look at all of it does not wait.

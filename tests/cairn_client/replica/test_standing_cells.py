@@ -9,6 +9,7 @@ import pytest
 from tests.fixtures.client.made import (
     A,
     B,
+    added,
     cell_frame,
     committed,
     covering,
@@ -150,6 +151,23 @@ def reopened(replica: Replica, folder: Path) -> Replica:
     """The same folder, opened again."""
     replica.close()
     return opened(folder)
+
+
+def test_a_cell_that_is_asked_for_whole_keeps_the_coverage_that_it_had_with_the_others(
+    mole: Replica, tmp_path: Path
+) -> None:
+    joined(mole, [A, B])
+    commit = committed(mole, Y, A)
+    mole.acknowledge(commit.id)
+    whole = added(X, Y)
+    frame = cell_frame(FrameKind.FULL, C2, whole, key=A, start=C1)
+    assert exchanged(mole, header(C2, covering(commit.id)), frame, done(C2, (B, X))).is_done
+    other = cell_frame(FrameKind.RESET, C3, Y, key=A, start=C2)
+    exchanged(mole, header(C3, covering(commit.id)), other, done(C3, (B, X)))
+    for replica in (mole, reopened(mole, tmp_path / "mole")):
+        assert (replica.cells[A].cursor, commit.id in replica.cells[A].coverage) == (None, True)
+        assert replica.view.evidence(A) == whole
+    replica.close()
 
 
 def test_own_commits_leave_the_view_of_cells_together_once_they_are_covered(mole: Replica) -> None:

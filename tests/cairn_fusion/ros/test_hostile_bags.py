@@ -82,6 +82,13 @@ def test_a_chunk_of_very_many_records_is_refused(tmp_path: Path, monkeypatch: py
     assert "more than 100 records" in refused
 
 
+def test_a_message_of_a_time_that_no_clock_has_is_refused(tmp_path: Path) -> None:
+    last_ns = 2**63 - 1
+    assert messages_of(write_mcap(tmp_path / "last.mcap", [message2(last_ns)])) == 1
+    late = write_mcap(tmp_path / "late.mcap", [message2(last_ns + 1)])
+    assert f"{last_ns + 1} ns" in refusal_of(late)
+
+
 def test_a_message_that_waits_counts_as_its_whole_chunk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A small message that waits for its turn keeps its whole unpacked chunk in memory."""
     monkeypatch.setattr(mcap_bag, "WAITING_BYTES_MAX", 1 << 20)
