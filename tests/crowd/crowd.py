@@ -19,12 +19,15 @@ from websockets.asyncio.client import connect
 from websockets.exceptions import WebSocketException
 from websockets.typing import Subprotocol
 
+from cairn_map.evidence.grid import CellKey, cell_of_key
 from cairn_server.http.middleware.token_first import TOKEN_PREFIX
 from cairn_server.http.routes.live import PROTOCOL
 from cairn_server.http.routes.sync import COMMIT_MEDIA_TYPE
 
 INCARNATION = "0" * 16  # what `Bodies` writes
 LAST_FETCHES_AT_ONCE = 8
+JOINS_MAX = 50
+"""Most requests of a first fetch: one ends early when the map's head moves between two of its parts."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +63,8 @@ class CrowdRobot:
         self._bodies = bodies
         self._seen = seen
         self._pushed = 0
+        self._held: dict[CellKey, str] = {}
+        """Cursors of cells that came in replies which ended early, until one comes whole."""
 
     async def join(self) -> None:
         """Register, and fetch the whole map."""
@@ -67,7 +72,13 @@ class CrowdRobot:
         body = json.dumps({"robot": self.name, "incarnation": INCARNATION}).encode()
         answer = await self.link.ask("POST", f"{self._path}/branches", body)
         self.link.token = json.loads(answer)["token"]
-        await self.fetch(self._seen.joins)
+        start_s = time.perf_counter()
+        for _ in range(JOINS_MAX):
+            await self.fetch(Times())
+            if self.cursor is not None:
+                self._seen.joins.seconds.append(time.perf_counter() - start_s)
+                return
+        raise BadAnswerError("no end of the first fetch")
 
     async def live(self, crowd: Crowd, first_s: float, end_s: float) -> None:
         """Rounds until the end."""
@@ -108,6 +119,7 @@ class CrowdRobot:
             "cursor": self.cursor,
             "since": "cursor" if self.cursor else None,
             "kinds": ["delta", "state", "full"],
+            "cells": [{"cell": cell_of_key(key), "cursor": cursor} for key, cursor in self._held.items()],
         }
         start_s = time.perf_counter()
         reply = await self.link.ask("POST", f"{self._path}/branches/{self.name}/missing", json.dumps(request).encode())
@@ -116,7 +128,10 @@ class CrowdRobot:
         if self.cursor is not None and _order(told.cursor) < _order(self.cursor):
             raise BadAnswerError("the head went back")
         self._seen.frames.update(told.kinds)
-        self.cursor = told.cursor
+        if told.brought is None:
+            self.cursor, self._held = told.cursor, {}
+        else:
+            self._held |= dict.fromkeys(told.brought, told.cursor)
 
     async def report(self) -> None:
         """Where it is and how it does."""

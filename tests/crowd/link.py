@@ -12,11 +12,13 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import Self
 
-from cairn_map.wire.frames import MAGIC, PREFIX, FrameKind
+from cairn_map.evidence.grid import CellKey
+from cairn_map.wire.frames import MAGIC, PREFIX, CellFrame, FrameKind, frames_of
 
 ANSWER_S = 60.0
 CHUNK_BYTES = 1 << 18
 LENGTH = re.compile(rb"\r\ncontent-length: *(\d+)", re.IGNORECASE)
+CHUNKED = re.compile(rb"\r\ntransfer-encoding: *chunked", re.IGNORECASE)
 TO = re.compile(rb'\{"to":"([^"]+)"')
 CHECKSUM_BYTES = 4
 
@@ -31,13 +33,15 @@ class Told:
 
     cursor: str
     kinds: Counter[FrameKind]
+    brought: tuple[CellKey, ...] | None
+    """Cells of a reply that ended before all of them were sent; None: it was whole."""
 
     @classmethod
     def by(cls, reply: bytes | bytearray) -> Self:
         """A whole reply.
 
         Raises:
-            BadAnswerError: it does not begin with a header, or does not end with `done`.
+            BadAnswerError: it does not begin with a header, or ends neither with `done` nor with `more`.
         """
         start = len(MAGIC) + 1
         to = TO.match(reply, start + PREFIX.size)
@@ -49,9 +53,12 @@ class Told:
             size, last = PREFIX.unpack_from(reply, at)
             kinds[FrameKind(last)] += 1
             at += PREFIX.size + size + CHECKSUM_BYTES
-        if at != len(reply) or last != FrameKind.DONE:
+        if at != len(reply) or last not in (FrameKind.DONE, FrameKind.MORE):
             raise BadAnswerError("no end of the frames")
-        return cls(to[1].decode(), kinds)
+        brought = None
+        if last == FrameKind.MORE:
+            brought = tuple(frame.cell for frame in frames_of(bytes(reply)) if isinstance(frame, CellFrame))
+        return cls(to[1].decode(), kinds, brought)
 
 
 class Link:
@@ -100,6 +107,10 @@ class Link:
         data = bytearray()
         while (end := data.find(b"\r\n\r\n")) < 0:
             data += _some(await loop.sock_recv(link, CHUNK_BYTES))
+        if CHUNKED.search(data, 0, end):
+            body = await self._chunks(data[end + 4 :])
+            self.received_bytes += end + 4 + len(body)
+            return int(data[9:12]), body
         found = LENGTH.search(data, 0, end)
         body = bytearray(int(found[1]) if found else 0)
         at = len(data) - end - 4
@@ -112,6 +123,21 @@ class Link:
                 at += count
         self.received_bytes += end + 4 + len(body)
         return int(data[9:12]), body
+
+    async def _chunks(self, data: bytearray) -> bytearray:
+        """The body of an answer that comes in chunks; `data` is what came with its head."""
+        assert self._socket is not None
+        loop, link, body, at = asyncio.get_running_loop(), self._socket, bytearray(), 0
+        while True:
+            while (end := data.find(b"\r\n", at)) < 0:
+                data += _some(await loop.sock_recv(link, CHUNK_BYTES))
+            size = int(data[at:end], 16)
+            at = end + 2 + size + 2
+            while len(data) < at:
+                data += _some(await loop.sock_recv(link, CHUNK_BYTES))
+            if not size:
+                return body
+            body += memoryview(data)[end + 2 : at - 2]
 
 
 def _some(data: bytes) -> bytes:

@@ -1,5 +1,6 @@
 """A few seconds of `make soak`'s crowd: everybody is answered, and what they are sent is the server's map."""
 
+import asyncio
 from collections import Counter
 from pathlib import Path
 
@@ -7,14 +8,15 @@ import pytest
 from tests.crowd.building import survey
 from tests.crowd.crowd import Crowd
 from tests.crowd.figures import fold_lags, rise_of
-from tests.crowd.link import BadAnswerError, Told
+from tests.crowd.link import BadAnswerError, Link, Told
 from tests.crowd.soak import soak
 from tests.crowd.verdict import findings, summary
 
-from cairn_map.commits.cursor import Cursor
+from cairn_map.commits.cursor import Cursor, cursor_from_text
 from cairn_map.evidence.fingerprint import ZERO
-from cairn_map.wire.frames import FrameKind, encode_frame, start_of_reply
-from cairn_map.wire.messages import Done, ReplyHeader
+from cairn_map.evidence.grid import CellKey
+from cairn_map.wire.frames import CellFrame, FrameKind, encode_frame, start_of_reply
+from cairn_map.wire.messages import Done, More, ReplyHeader
 
 CURSOR = str(Cursor(bytes(16), 7, bytes(16)))
 HEADER = encode_frame(ReplyHeader(to=CURSOR, vector={}, stable={}))
@@ -34,7 +36,42 @@ def test_a_small_crowd_is_served_without_an_error_and_ends_with_the_servers_map(
 
 def test_a_reply_is_read_as_far_as_its_cursor_and_its_end() -> None:
     told = Told.by(start_of_reply() + HEADER + DONE)
-    assert (told.cursor, told.kinds) == (CURSOR, Counter([FrameKind.HEADER, FrameKind.DONE]))
+    assert (told.cursor, told.kinds, told.brought) == (CURSOR, Counter([FrameKind.HEADER, FrameKind.DONE]), None)
+
+
+def test_a_reply_that_ends_early_names_the_cells_it_brought() -> None:
+    to = cursor_from_text(CURSOR)
+    cell = CellFrame(kind=FrameKind.FULL, cell=CellKey(5), from_cursor=None, to_cursor=to, fingerprint=ZERO)
+    assert Told.by(start_of_reply() + HEADER + encode_frame(cell) + encode_frame(More(to=CURSOR))).brought == (5,)
+
+
+def test_an_answer_in_chunks_is_read_to_its_end() -> None:
+    """However they are cut on their way."""
+
+    async def told() -> bytearray:
+        async def answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            await reader.readuntil(b"\r\n\r\n")
+            for part in (
+                b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chun",
+                b"ked\r\n\r\n3\r\nab",
+                b"c\r\n1",
+                b"0\r\n" + b"d" * 16,
+            ):
+                writer.write(part)
+                await writer.drain()
+            writer.write(b"\r\n0\r\n\r\n")
+            writer.close()
+            await writer.wait_closed()
+
+        async with await asyncio.start_server(answer, "127.0.0.1") as server:
+            link = Link(server.sockets[0].getsockname()[1], "token")
+            await link.open()
+            try:
+                return await link.ask("GET", "/", b"")
+            finally:
+                link.close()
+
+    assert asyncio.run(told()) == b"abc" + b"d" * 16
 
 
 @pytest.mark.parametrize("reply", [b"", DONE, HEADER, HEADER + DONE[:-1], HEADER + DONE + b"x"])
