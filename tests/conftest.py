@@ -1,10 +1,17 @@
-"""Order of the files (the slowest first, so that no worker has one left when others are done), stores, and signals."""
+"""Order of the files (slowest first, so that no worker has one left when others are done), stores, signals, laws."""
 
 import os
 import signal
 from collections.abc import Iterator
 
 import pytest
+from hypothesis import HealthCheck, settings
+
+# No deadline: the first call of a kernel compiles it, and the machine may be loaded.
+settings.register_profile(
+    "cairn", max_examples=50, deadline=None, database=None, suppress_health_check=[HealthCheck.too_slow]
+)
+settings.load_profile("cairn")
 
 # What fixtures assert is told as fully as what tests assert.
 pytest.register_assert_rewrite("tests.fixtures")

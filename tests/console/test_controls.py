@@ -22,7 +22,7 @@ WALKS = """[[0, 1], [0, -1], [1, 0], [-1, 0]].map(([right, forward]) => {
   c.stage.place(a[1]);
   return Array.from({ length: a[0] }, () => (c.walk(right, forward), c.stage.view.eye));
 })"""
-"""Where who walks straight on comes by, from one place ahead, back, right and left."""
+"""Directions of a walk from one place: ahead, back, right and left."""
 NEAREST_M, BEFORE_M, FAR_M = 0.3, 0.1, float(np.hypot(3, 2.2))
 """Of the eye from who is followed, and from what would be in between."""
 
@@ -203,7 +203,7 @@ def test_who_walks_goes_as_far_as_the_walls_let(console: Console, room: Room) ->
 
 
 def away_from(corners: npt.NDArray[np.float64], eye: npt.NDArray[np.float64], over_m: float) -> float:
-    """How far the nearest voxel, so high over the floor, is from the middle of a body whose eyes are here, level, m."""
+    """Level distance from the middle of a body to the nearest voxel so high over the floor, m; its eyes are here."""
     half_m = GEOMETRY.voxel_edge_m / 2
     body = (corners[:, 2] + 2 * half_m > eye[2] - EYES_M + over_m) & (corners[:, 2] < eye[2])
     off = np.maximum(np.abs(corners[body, :2] + half_m - eye[:2]) - half_m, 0)

@@ -1,4 +1,4 @@
-"""Where there is no map to show, the page says why and what to do; the commands that it gives are run here."""
+"""Messages of a page without a map: cause and next step; the commands that they give are run here."""
 
 import re
 import shlex

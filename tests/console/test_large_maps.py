@@ -14,7 +14,7 @@ pytestmark = pytest.mark.browser
 CAMPUS = "campus"
 CELLS = 660
 SLACK = 1.15
-"""Of scene/detail.ts."""
+"""The same constant as in scene/detail.ts."""
 PLANS = 20
 MADE_AGAIN = f"""(() => {{
   const before = [...c.cells.all.values()].map(({{ wanted }}) => wanted).join();

@@ -29,12 +29,12 @@ NEARER = """a[0].map(([x, y]) => {
   const away = (right, down) => c.picker.at(x + right, y + down)?.point.distanceTo(c.stage.camera.position) ?? 1e3;
   return away(0, 0) - Math.min(...[-1, 0, 1].flatMap((right) => [-1, 0, 1].map((down) => away(right, down))));
 })"""
-"""How much nearer the nearest of the pixels around each is, m."""
+"""Depth of each pixel less that of the nearest one around it, m."""
 EDGES = 20
 FLAT_MAX = 0.95
 """Least brightness that is left on a flat floor."""
 OVER = (0xFF, 0x6A, 0xD5)
-"""Of palettes.ts."""
+"""The same constant as in palettes.ts."""
 TOWER, STOREY_CELLS = "tower", 1
 """A map of two rooms, one so many cells over the other: the roof of the lower one is the floor of the upper one."""
 GROUND = (0x0E, 0x11, 0x16)

@@ -23,7 +23,7 @@ Key = tuple[int, bytes, str]
 
 @dataclass(slots=True)
 class Sent:
-    """What one sender sent of an attachment; an empty sender: the whole."""
+    """Parts of an attachment that one sender sent; the whole of it under an empty sender."""
 
     account: str
     size_bytes: int
@@ -114,7 +114,7 @@ class MemoryAttachments:
             return len(gone) == SWEEP_MAX
 
     def _named(self, map_number: int) -> Iterator[tuple[Kept, Attachment]]:
-        """What living marks name, with their commits, oldest first."""
+        """Attachments that living marks name, with their commits, oldest first."""
         with self._maps.locked() as maps:
             states: list[MemoryMap] = [state for state in maps.values() if state.row.number == map_number]
         for state in states:

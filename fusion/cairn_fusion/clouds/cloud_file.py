@@ -125,7 +125,10 @@ def _read_las(data: bytes, name: str) -> dict[str, Column]:
                 columns: dict[str, Column] = {axis: np.asarray(getattr(las, axis), np.float64) for axis in "xyz"}
     except BadInputError:
         raise
-    except Exception as exc:  # laspy and its decoders raise errors of many kinds for damaged files
+    except BaseException as exc:  # laspy and its decoders raise errors of many kinds for damaged files
+        # A panic of lazrs, which is Rust, is no Exception, and its class has no module to be imported from.
+        if not isinstance(exc, Exception) and type(exc).__name__ != "PanicException":
+            raise
         raise bad_cloud(name, f"laspy cannot read it: {exc}") from exc
     if "gps_time" in las.point_format.dimension_names:
         columns["gps_time"] = np.asarray(las.gps_time, np.float64)

@@ -58,6 +58,15 @@ def test_spoilt_bytes_are_refused_or_read_and_nothing_else(write: Write, tmp_pat
         assert str(path) in exc.message
 
 
+def test_a_file_at_which_the_decoder_of_laz_panics_is_refused(tmp_path: Path) -> None:
+    path = one_file(tmp_path, cloud_forms.laz)
+    raw = bytearray(path.read_bytes())
+    raw[461] = 0  # number of items of a point
+    path.write_bytes(raw)
+    with pytest.raises(BadInputError, match="laspy cannot read it"):
+        read_cloud(path)
+
+
 def test_heads_that_announce_more_than_there_is_are_refused_before_any_array(tmp_path: Path) -> None:
     many = 1 << 23
     heads = {
