@@ -30,7 +30,7 @@ from cairn_fusion.ros.bag_index import translate_message_damage, wire_of
 from cairn_fusion.ros.bag_scans import BagScan, PoseAt
 from cairn_fusion.ros.images import AnyImage, Pixels, amplitude_of, colour_of, depth_of, thermal_counts_of
 from cairn_fusion.ros.messages import IMAGE, read_compressed_image, read_image
-from cairn_fusion.ros.point_clouds import check_beams, read_points
+from cairn_fusion.ros.point_clouds import check_beams, read_cloud
 from cairn_fusion.ros.topic_mapping import BagMapping, LidarKind, MappedCamera
 
 PixelsT = TypeVar("PixelsT", bound=Pixels)
@@ -96,9 +96,9 @@ class ScanDecoder:
         self, camera: MappedCamera, found: BagScan, message: MessageOf, pose_at: PoseAt | None
     ) -> npt.NDArray[np.float64]:
         """(N, 3) the points of a lidar's cloud, metres, its own frame; of a known lidar they must lie on its beams."""
-        sweep = message(camera.topic)
+        sweep, topic = message(camera.topic), self._topics[camera.topic]
         with translate_message_damage(self._source, sweep):
-            points = read_points(sweep.data, wire_of(self._topics[camera.topic]))
+            points = read_cloud(sweep.data, wire_of(topic), type_name=topic.type)
             xyz = points.xyz()
         if not is_loose(camera):
             check_beams(xyz, self._lidar(found.camera), found.camera)

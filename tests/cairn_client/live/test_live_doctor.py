@@ -3,19 +3,20 @@
 import json
 import socket
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
 import pytest
 from tests.fixtures.client.live_run import MAKE
 from tests.fixtures.fusion.bags import Timed
 from tests.fixtures.fusion.drive_mapping import TOPICS, mapping_text
-from tests.fixtures.fusion.live_drive import START_S, bag_message, drive
+from tests.fixtures.fusion.live_drive import START_S, bag_message, drive, latched, moving
 
 from cairn_client import main as cairn
 from cairn_client.cli.doctor.checks import Check, CheckResult
 from cairn_client.cli.doctor.live_checks import live_checks
-from cairn_fusion.ros.bag import BagMessage, Topic
+from cairn_fusion.ros.bag import BagMessage, Topic, Wire
 from cairn_map.machine_clocks import MachineClocks
 
 TICK_S = 0.1
@@ -26,9 +27,16 @@ class ScriptedDoor:
 
     url, links, damaged, lost_since_s = "ws://robot:8765", 1, 0, None
 
-    def __init__(self, timed: Sequence[Timed], *, lead_s: float = 0.0, look_s: float = 0.0) -> None:
+    def __init__(
+        self,
+        timed: Sequence[Timed],
+        *,
+        lead_s: float = 0.0,
+        look_s: float = 0.0,
+        topics: Mapping[str, Topic] = TOPICS,
+    ) -> None:
         self.now_s = 0.0
-        self.topics: dict[str, Topic] = dict(TOPICS)
+        self.topics = dict(topics)
         self.counts: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
         self.is_closed = False
@@ -58,10 +66,9 @@ class ScriptedDoor:
 
 
 @pytest.fixture
-def checks_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[ScriptedDoor], dict[str, Check]]:
-    (tmp_path / "live.yaml").write_text(mapping_text())
-
-    def checks_of(door: ScriptedDoor) -> dict[str, Check]:
+def checks_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> "Checks":
+    def checks_of(door: ScriptedDoor, text: str = mapping_text()) -> dict[str, Check]:
+        (tmp_path / "live.yaml").write_text(text)
         monkeypatch.setattr("cairn_client.cli.doctor.live_checks.open_door", lambda url, ca_file: door)
         found = {check.what: check for check in live_checks(door.url, tmp_path / "live.yaml", clocks=door.clocks)}
         assert door.is_closed
@@ -71,7 +78,7 @@ def checks_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Scri
     return checks_of
 
 
-Checks = Callable[[ScriptedDoor], dict[str, Check]]
+Checks = Callable[..., dict[str, Check]]
 
 
 def test_a_sound_robot_passes_every_check(checks_of: Checks) -> None:
@@ -110,6 +117,24 @@ def test_a_robot_that_sends_nothing_is_known_within_ten_seconds(checks_of: Check
     door = ScriptedDoor([])
     (check,) = checks_of(door).values()
     assert "a publisher is there, nothing came in 5 s: " in check.found and door.now_s < 10.0
+
+
+def test_clouds_of_livox_become_scans(checks_of: Checks) -> None:
+    points = np.random.default_rng(1).uniform(1, 4, (30, 3)).astype(np.float32)
+    after_ns = np.arange(30, dtype=np.uint32) * 1_000_000
+    timed = [latched(MAKE), *(moving(MAKE, START_S + n / 20) for n in range(-2, 122))]
+    timed += [(t, "/livox", MAKE.livox(t, "depth_frame", points, after_ns)) for t in START_S + np.arange(60) / 10]
+    topics = {name: TOPICS[name] for name in ("/tf", "/tf_static")}
+    topics["/livox"] = Topic("/livox", "livox_ros_driver2/CustomMsg", Wire.CDR, 0)
+    text = "\n".join(
+        [
+            "name: drive\nframes: {map: odom, base: base_link}\nposes: {topic: /tf, max_gap_s: 0.2}",
+            "cameras: {lidar: {spectrum: range, topic: /livox, lidar: {kind: cloud}}}",
+        ]
+    )
+    timed.sort(key=lambda entry: entry[0])
+    found = checks_of(ScriptedDoor(timed, topics=topics), text)
+    assert {check.verdict for check in found.values()} == {CheckResult.OK}, found
 
 
 def test_no_bridge_is_one_line_and_the_exit_code(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
