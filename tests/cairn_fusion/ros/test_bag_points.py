@@ -11,6 +11,10 @@ from rosbags.typesys import get_types_from_msg
 from tests.fixtures.fusion.bags import KINDS, ROS2, Messages, Timed, pose_of, write_bag
 from tests.fixtures.fusion.cloud_forms import beams, off_walls_m, pcd_binary, seen
 from tests.fixtures.fusion.cloud_forms import pose_of as room_pose
+from tests.fixtures.fusion.drive_mapping import MAPPING, mapping_text
+from tests.fixtures.fusion.live_drive import START_S as LIVE_START_S
+from tests.fixtures.fusion.live_drive import drive as live_drive
+from tests.fixtures.fusion.live_drive import in_bag_order
 from tests.fixtures.fusion.pose_forms import kitti
 
 from cairn_calib.rig.lidar import SpinningLidar
@@ -381,3 +385,20 @@ def test_a_livox_cloud_that_announces_more_than_it_has_takes_no_memory() -> None
     empty = cdr("<")[: 4 + 16 + 16] + bytes(4)
     points = read_livox(empty, Wire.CDR)
     assert points.xyz().shape == (0, 3) and elevations_of(points) is None
+
+
+def test_a_cloud_next_to_cameras_is_a_scan_without_their_images(tmp_path: Path) -> None:
+    points = np.random.default_rng(3).uniform(1, 4, (30, 3)).astype(np.float32)
+
+    def messages(make: Messages) -> Iterator[Timed]:
+        timed = [*live_drive(make, scans=5)]
+        timed += [(t, "/points", loose_cloud(make, t, points)) for t in LIVE_START_S + np.arange(4) / 10 + 0.03]
+        return in_bag_order(sorted(timed, key=lambda entry: entry[0]))
+
+    lidar = {"spectrum": "range", "topic": "/points", "lidar": {"kind": "cloud"}, "frame": "depth_frame"}
+    text = mapping_text(cameras={**MAPPING["cameras"], "lidar": lidar})  # type: ignore[dict-item]
+    scans = list(open_source(write_bag(tmp_path / "drive", "mcap", messages), mapping=mapping_from_yaml(text, "it")))
+    loose = [scan for scan in scans if scan.range_camera == "lidar"]
+    assert len(loose) == 4 and len(scans) > 7
+    assert not any(scan.colour or scan.thermal for scan in loose)
+    assert any(scan.colour for scan in scans if scan.range_camera == "depth")
