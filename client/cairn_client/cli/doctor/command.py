@@ -71,10 +71,11 @@ def main(argv: list[str]) -> int:
     add_token(command)
     args = command.parse_args(argv)
     checks: list[Check] = []
-    is_live = args.target is not None and args.target.startswith(SCHEMES)
+    target: str = args.target or ""
+    is_live = target.startswith(SCHEMES)
     if not is_live and (args.topics or args.ca):
         raise BadInputError("bad_option", f"--topics and --ca are of a live robot; {URL_HELP}")
-    found = _live(args.target, args.topics, args.ca) if is_live else _checks(args.target, args.others, args.token)
+    found = _live(target, args.topics, args.ca) if is_live else _checks(args.target, args.others, args.token)
     for check in found:
         checks.append(check)
         if not args.json:

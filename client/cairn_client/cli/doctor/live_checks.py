@@ -8,7 +8,7 @@ from cairn_client.cli.doctor.checks import Check, CheckResult
 from cairn_client.live.live_doors import open_door
 from cairn_client.live.live_opening import OpenedLive, mapping_for, open_live
 from cairn_client.live.live_source import LiveSource
-from cairn_client.live.source_watch import SourceWatch
+from cairn_client.live.source_watch import SourceWatch, TopicStatus
 from cairn_fusion.ros.bag import BagMessage
 from cairn_fusion.ros.live_scans import ReadyScan
 from cairn_fusion.ros.scan_decoder import ScanDecoder
@@ -68,13 +68,15 @@ def _arrivals(
     names = sorted(opened.topics)
     # Stage 2: scans as they would be mapped, of which the first is decoded.
     ready, decoder = 0, ScanDecoder(url, mapping, opened.rig, opened.topics)
-    while (now_s := clocks.steady_s()) < start_s + WATCH_S:
-        for scan in _scans_of(opened, source.take(within_s=TAKE_S), now_s):
+    span_s, statuses = 0.0, list[TopicStatus]()
+    while span_s < WATCH_S:
+        for scan in _scans_of(opened, source.take(within_s=TAKE_S), clocks.steady_s()):
             if not ready:
                 decoder.decode(scan.found, scan.messages.__getitem__, scan.pose_at)
             ready += 1
         watch.note_lead(clocks.wall_s())
-        span_s, counts = max(now_s - start_s, TAKE_S), source.counts
+        now_s, counts = clocks.steady_s(), source.counts
+        span_s = max(now_s - start_s, TAKE_S)
         rates_hz = {name: (counts[name] - first[name]) / span_s for name in names}
         statuses = watch.topic_statuses(now_s, counts, rates_hz, dropped=source.dropped)
     # Stage 3: what is missing, in the words of the status line.
