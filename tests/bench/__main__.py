@@ -31,6 +31,7 @@ from tests.bench.imports import import_rows
 from tests.bench.integration import integration_rows
 from tests.bench.large_map import large_map_rows
 from tests.bench.links import link_rows
+from tests.bench.live_mapping import live_mapping_rows
 from tests.bench.many_maps import many_map_rows
 from tests.bench.marks import mark_rows
 from tests.bench.overlay import overlay_rows
@@ -282,6 +283,7 @@ def _cpu_s(work: Callable[[], object]) -> float:
 PARTS: dict[str, Callable[[bool], Iterator[Row]]] = {
     "room": _room_rows,
     "amending": amending_rows,
+    "live": live_mapping_rows,
     "calibration": calibration_rows,
     "coding": coding_rows,
     "console": console_rows,

@@ -72,6 +72,8 @@ def _messages(make: Messages) -> Iterator[tuple[str, Any]]:
     yield "depth-png", make.compressed(t, eye, "32FC1; compressedDepth png", bytes(12) + png(COUNTS))
     yield "points", _points(make, t, rows=2)
     yield "no-points", _points(make, t, rows=0)
+    few = np.random.default_rng(2).normal(0, 3, (3, 3)).astype(np.float32)
+    yield "livox", make.livox(t, "livox", few, np.arange(3, dtype=np.uint32) * 10_000)
 
 
 def _points(make: Messages, time_s: float, *, rows: int) -> Any:

@@ -16,11 +16,11 @@ from cairn_fusion.ros.bag_recording import open_any_bag, survey
 from cairn_fusion.ros.images import amplitude_of, colour_of, depth_of, thermal_counts_of
 from cairn_fusion.ros.messages import (
     CAMERA_INFO,
+    CLOUDS,
     COMPRESSED,
     IMAGE,
     ODOMETRY,
     PATH,
-    POINTS,
     POSES,
     STAMPED,
     read_camera_info,
@@ -32,7 +32,7 @@ from cairn_fusion.ros.messages import (
     read_transforms,
 )
 from cairn_fusion.ros.open_bag import is_bag
-from cairn_fusion.ros.point_clouds import elevations_of, read_points
+from cairn_fusion.ros.point_clouds import elevations_of, read_cloud
 from cairn_fusion.ros.topic_mapping import camera_of_info, mapping_of
 from cairn_map.errors import CairnError
 
@@ -79,8 +79,8 @@ def _use_message(kind: str, message: bytes, wire: Wire) -> None:
             camera_of_info(info, is_rectified=is_rectified, name="it")
     elif kind == PATH:
         assert len(read_path(message, wire).poses) * 68 <= len(message)
-    elif kind == POINTS:
-        points = read_points(message, wire)
+    elif kind in CLOUDS:
+        points = read_cloud(message, wire, type_name=kind)
         elevations_of(points)
         assert sweep_image(points.xyz(), LIDAR).shape == (LIDAR.height, LIDAR.width)
     else:

@@ -15,6 +15,10 @@ Points = npt.NDArray[np.float64]
 
 ROTATION_TOLERANCE = 1e-4
 """Largest deviation of R^T R from the identity that is taken for rounding in a text file."""
+IDENTITY, LAST_ROW = np.eye(3), np.array([0.0, 0.0, 0.0, 1.0])
+LAST_ROW_TOLERANCE = np.array([1e-9, 1e-9, 1e-9, 1e-5 + 1e-9])
+"""Largest deviation of the last row from 0 0 0 1. A pose is checked with every scan, and `np.allclose` and `np.eye`
+take half of that."""
 
 
 def check_transform(
@@ -33,7 +37,7 @@ def check_transform(
     T = np.array(values, dtype=np.float64)
     if T.shape != (4, 4) or not np.isfinite(T).all():
         raise BadInputError("bad_transform", f"{name} must be 4x4 finite numbers, got shape {T.shape}")
-    if not np.allclose(T[3], (0, 0, 0, 1), atol=1e-9):
+    if (np.abs(T[3] - LAST_ROW) > LAST_ROW_TOLERANCE).any():
         raise BadInputError("bad_transform", f"{name} must end in the row 0 0 0 1, got {T[3].tolist()}")
     R = T[:3, :3]
     deviation = rotation_deviation(R)
@@ -46,20 +50,20 @@ def check_transform(
         )
     U, _, Vt = np.linalg.svd(R)
     T[:3, :3] = U @ Vt
-    T[3] = (0, 0, 0, 1)
+    T[3] = LAST_ROW
     return T
 
 
 def rotation_deviation(R: npt.NDArray[np.float64]) -> float:
     """Largest absolute entry of R^T R - I of a (3, 3) matrix: 0 for a rotation or a mirror; NaN beyond 1e154."""
     with np.errstate(over="ignore", invalid="ignore"):
-        return float(np.abs(R.T @ R - np.eye(3)).max())
+        return float(np.abs(R.T @ R - IDENTITY).max())
 
 
 def inverse(T_dst_src: Transform) -> Transform:
     """`T_src_dst`, by transposing the rotation (exact for a rigid transform)."""
-    T = np.eye(4)
-    T[:3, :3] = T_dst_src[:3, :3].T
+    T = np.empty((4, 4))
+    T[:3, :3], T[3] = T_dst_src[:3, :3].T, LAST_ROW
     T[:3, 3] = -T_dst_src[:3, :3].T @ T_dst_src[:3, 3]
     return T
 

@@ -2,7 +2,7 @@
 
 A measurement is taken in its newest form: its scans stand where its last amend put them, bit for bit.
 
-The robot's map is not read, so a folder takes the memory of one measurement, however large its map is; only a robot
+The robot's map is not read, so a folder takes the memory of a few measurements, however large its map is; only a robot
 whose disk is bounded reads it, to drop what makes room. The view changes when the robot opens the folder again.
 """
 

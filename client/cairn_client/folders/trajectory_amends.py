@@ -8,7 +8,10 @@ Rig and integrator stay those of each measurement's newest form. A measurement i
 trajectory's, bit for bit: so a second run finds nothing to do, and one after a kill goes on.
 """
 
+import os
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -18,6 +21,7 @@ import numpy.typing as npt
 from cairn_calib.rig.poses import Transform, check_transform
 from cairn_calib.rig.rig import Rig
 from cairn_client.folders.kept_folder import Form, KeptFolder, form_of, forms_without_scans
+from cairn_client.replica.outbox import CommitFacts
 from cairn_client.robot.amending import facts_of_measurement
 from cairn_fusion.mapping.integrate import Integrator, integrator_from_text
 from cairn_fusion.mapping.measurement import Measurement, scan_pose
@@ -27,10 +31,17 @@ from cairn_map.codec.cell_code import Profile
 from cairn_map.commits.commit import ScanPose
 from cairn_map.commits.ids import CommitId
 from cairn_map.errors import BadInputError, CairnError, ConflictError, DamagedDataError, NotFoundError, UnreachableError
+from cairn_map.evidence.evidence import Evidence
+from cairn_map.evidence.grid import CellKey
 
 PosesOf = Callable[[Sequence[FrameKey]], "list[Transform | None]"]
 """Poses of the scans of these times in the map's frame; None for scans that stay as they are, with all of theirs."""
 Poses = npt.NDArray[np.float64]
+Diff = dict[CellKey, Evidence]
+Integrated = Callable[[], tuple[Diff, CommitFacts]]
+"""The evidence of a measurement and its facts, once they are computed; raises why they cannot be."""
+THREADS = min(os.cpu_count() or 1, 4)
+"""Threads that integrate, each with the memory of one measurement."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,9 +205,12 @@ def move_all(opened: KeptFolder, plan: MovePlan, given: Rig | None, *, profile: 
         profile: coding of the commits.
         note: the reason, for the map's log.
     """
-    for move in plan.moves:
+    for move, integrated in _integrated_ahead(opened, plan.moves, given, note):
         try:
-            _amend(opened, move, given, profile, note)
+            diff, facts = integrated()
+            commit = opened.write(move.original, diff, facts, profile=profile, T_map_rig=move.T_map_rig)
+            # A kill here leaves the scans under the older id, from which the amend's record leads to the new one.
+            opened.kept.rename(move.original, commit.id)
             plan.amended += 1
         except UnreachableError as exc:  # no room: the next one would find none either
             plan.stopped = exc
@@ -206,22 +220,44 @@ def move_all(opened: KeptFolder, plan: MovePlan, given: Rig | None, *, profile: 
         yield move
 
 
-def _amend(opened: KeptFolder, move: Move, given: Rig | None, profile: Profile, note: str) -> None:
-    """Integrate one measurement's scans at their new poses, and commit that in its place; all of it or nothing."""
-    form = form_of(opened, opened.outbox.successors.latest(move.original))
-    integrator = integrator_from_text(form.integrator) or Integrator()
-    measurement = Measurement(_rig_of(opened, form, given), opened.layer.geometry, integrator)
-    for scan, T_map_rig in zip(opened.kept.scans(move.original), move.T_map_rig, strict=True):
-        measurement.add(place_scan(scan, T_map_rig))
-    commit = opened.write(
-        move.original,
-        measurement.diff(),
-        facts_of_measurement(measurement, note=note),
-        profile=profile,
-        T_map_rig=move.T_map_rig,
-    )
-    # A kill before this line leaves the scans under the older id, from which the amend's record leads to the new one.
-    opened.kept.rename(move.original, commit.id)
+def _integrated_ahead(
+    opened: KeptFolder, moves: Sequence[Move], given: Rig | None, note: str
+) -> Iterator[tuple[Move, Integrated]]:
+    """Moves in their order, each with its evidence, which threads compute ahead of the caller, who writes.
+
+    The evidence is the same in whatever order they are done: all of it is integers, and none depends on the map.
+    """
+    with ThreadPoolExecutor(THREADS) as pool:
+        waiting: deque[tuple[Move, Integrated]] = deque()
+        try:
+            for move in moves:
+                waiting.append((move, _start(pool, opened, move, given, note)))
+                if len(waiting) > THREADS:
+                    yield waiting.popleft()
+            while waiting:
+                yield waiting.popleft()
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _start(pool: ThreadPoolExecutor, opened: KeptFolder, move: Move, given: Rig | None, note: str) -> Integrated:
+    """Have a thread integrate one measurement's scans at their new poses; the result raises what that did."""
+    try:
+        # Read here: the folder's state belongs to the caller's thread.
+        form = form_of(opened, opened.outbox.successors.latest(move.original))
+        rig, integrator = _rig_of(opened, form, given), integrator_from_text(form.integrator) or Integrator()
+    except (BadInputError, DamagedDataError) as exc:
+        failed: Future[tuple[Diff, CommitFacts]] = Future()
+        failed.set_exception(exc)
+        return failed.result
+
+    def integrate() -> tuple[Diff, CommitFacts]:
+        measurement = Measurement(rig, opened.layer.geometry, integrator)
+        for scan, T_map_rig in zip(opened.kept.scans(move.original), move.T_map_rig, strict=True):
+            measurement.add(place_scan(scan, T_map_rig))
+        return measurement.diff(), facts_of_measurement(measurement, note=note)
+
+    return pool.submit(integrate).result
 
 
 def _rig_of(opened: KeptFolder, form: Form, given: Rig | None) -> Rig:

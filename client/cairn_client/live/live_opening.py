@@ -18,6 +18,7 @@ import numpy as np
 from cairn_calib.rig.poses import Transform
 from cairn_calib.rig.rig import Rig
 from cairn_client.live.inbox import Inbox
+from cairn_client.live.live_doors import open_door
 from cairn_client.live.live_source import LiveSource
 from cairn_fusion.ros.bag import BagMessage, Topic
 from cairn_fusion.ros.bag_index import BagIndex, TopicIndex, add_message, wire_of
@@ -25,12 +26,14 @@ from cairn_fusion.ros.bag_recording import Survey, image_topics, images_of, rig_
 from cairn_fusion.ros.live_scans import LiveScans
 from cairn_fusion.ros.messages import CAMERA_INFO, ODOMETRY, PATH, POSES, TRANSFORMS, RosTransform
 from cairn_fusion.ros.tf_tree import FrameTree
-from cairn_fusion.ros.topic_mapping import BagMapping
+from cairn_fusion.ros.topic_mapping import BagMapping, mapping_from_yaml, mapping_of
 from cairn_fusion.ros.topic_proposal import propose
 from cairn_map.errors import BadInputError, DamagedDataError
 
 OPEN_S = 8.0
 """Longest wait for all that a rig is built from, the connection included."""
+SURVEY_S = 3.0
+"""Time for which topics are listened to where no file names them."""
 LOOK_S = 0.1
 EARLY_BYTES_MAX = 256_000_000
 """Bytes of messages that are kept until the rig is known; beyond them the oldest images go."""
@@ -107,6 +110,29 @@ def open_live(
     scans.frames.hold([edge.child for edge in fixed], index.tree)
     waiting = early.take(within_s=0.0)
     return OpenedLive(rig, scans, topics, T_path_rig, fixed, tuple(infos.values()), waiting, early.dropped)
+
+
+def mapping_for(url: str, file: Path | None, *, ca_file: Path | None = None, within_s: float = SURVEY_S) -> BagMapping:
+    """The mapping of a source's topics: that of a topics file, else the proposed one if it leaves no question open.
+
+    Raises:
+        BadInputError: kind `undecided`: the proposal leaves something to decide; or the file is none, or no source is
+            there.
+    """
+    if file is not None:
+        return mapping_of(file)
+    source = open_door(url, ca_file=ca_file)
+    try:
+        proposal = survey_live(source, seconds=within_s, on_message=lambda: None).proposal
+    finally:
+        source.close()
+    if proposal.questions:
+        raise BadInputError(
+            "undecided",
+            f"{url} leaves something to decide: {'; '.join(proposal.questions)}. Write a file by `cairn robot inspect "
+            f"{url} --output live.yaml`, edit it, and give it with --topics live.yaml",
+        )
+    return mapping_from_yaml(proposal.text, f"the topics proposed for {url}")
 
 
 def named_topics(mapping: BagMapping) -> dict[str, str]:

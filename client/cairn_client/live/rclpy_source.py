@@ -19,7 +19,7 @@ from typing import Any
 from cairn_client.live.inbox import Inbox
 from cairn_client.live.live_source import bad_url, domain_of
 from cairn_fusion.ros.bag import BagMessage, Topic, Wire
-from cairn_fusion.ros.messages import COMPRESSED, IMAGE, POINTS, plain_type
+from cairn_fusion.ros.messages import CLOUDS, COMPRESSED, IMAGE, plain_type
 from cairn_map.errors import BadInputError
 
 log = logging.getLogger(__name__)
@@ -32,7 +32,7 @@ SPIN_S = 0.1
 CLOSE_S = 3.0
 IMAGES, SMALL = 10, 500
 """Messages of a topic that ROS keeps until they are taken: of images and clouds, and of all others."""
-LARGE = frozenset([IMAGE, COMPRESSED, POINTS])
+LARGE = frozenset([IMAGE, COMPRESSED]) | CLOUDS
 ROS_HELP = (
     "source the ROS of this machine first (source /opt/ros/$ROS_DISTRO/setup.bash), and run cairn with its Python, "
     "3.11 or newer; with Humble's 3.10, or without ROS here, use the Foxglove bridge: ws://HOST:8765"

@@ -68,6 +68,8 @@ class KeptScans:
         """Reason why the scans of the open measurement are not kept; empty if they are."""
         self._lost: dict[CommitId, str] = {}
         """Reasons why scans of some commits were not kept, newest last."""
+        self._rigs: dict[str, Rig] = {}
+        """Heads that were read: each remembers the rays of its cameras, which take long to compute."""
         # Replaced whole at each change, because the thread that syncs asks which commits are in it.
         self._files: dict[CommitId, ScanFile] = {}
         try:
@@ -200,8 +202,12 @@ class KeptScans:
         Raises:
             BadInputError: the disk damaged it.
         """
-        path = self._folder / f"{digest}{RIG_SUFFIX}"
-        return load_rig(path) if path.exists() else None
+        if digest not in self._rigs:
+            path = self._folder / f"{digest}{RIG_SUFFIX}"
+            if not path.exists():
+                return None
+            self._rigs[digest] = load_rig(path)
+        return self._rigs[digest]
 
     def why_gone(self, commit: CommitId) -> str:
         """Reason why the scans of a commit are not kept, with what to do about it."""

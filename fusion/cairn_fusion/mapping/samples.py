@@ -24,11 +24,10 @@ from cairn_fusion.transfer.transfer import (
     DEPTH_TOLERANCE_M,
     Label,
     Transfer,
-    depth_steps,
-    points_from_range,
     transfer_points,
 )
-from cairn_map.arrays import Floats, Ints, Labels
+from cairn_fusion.transfer.transfer_kernels import steps_of
+from cairn_map.arrays import Flags, Floats, Ints, Labels
 from cairn_map.evidence.channels import Channel, ChannelKind
 from cairn_map.evidence.grid import Geometry
 
@@ -57,12 +56,14 @@ def sample_sums(
     limits = SampleLimits(spread_max_m, step_max_k, hidden_behind_m)
     sight, numbers = ImageTransfers(scan, rig, returns, limits), voxel_of.astype(np.int32, copy=False)
     for channel in geometry.channels:
-        taken = np.zeros(len(returns.pixels), np.bool_)
+        taken, weight = np.zeros(len(returns.pixels), np.bool_), geometry.planes_of(channel.name).stop - 1
         # The first camera counts wherever it sees; the next ones fill only voxels hidden from those before.
-        for image, pixels, labels in sight.images_of(channel.kind):
+        for image, pixels, labels in sight.images_of(channel.kind, taken):
             totals, counts = np.zeros((count, channel.value_count)), np.zeros(count, np.int64)
             add_pixels_into(totals, counts, taken, np.atleast_3d(image), pixels, labels, numbers)
             _write_means_into(sums, geometry, channel, totals, counts)
+            # No further image adds to a voxel with a sample: most points need no look into the second one.
+            taken |= (sums[:, weight] != 0)[numbers]
     return sums
 
 
@@ -99,8 +100,13 @@ class ImageTransfers:
         self._limits = limits
         self._points: _Points | None = None
 
-    def images_of(self, kind: ChannelKind) -> Iterator[tuple[npt.NDArray[np.generic], Ints, Labels]]:
-        """Images of a kind, each with the pixels (N, 2) and labels (N,) of the points."""
+    def images_of(self, kind: ChannelKind, taken: Flags) -> Iterator[tuple[npt.NDArray[np.generic], Ints, Labels]]:
+        """Images of a kind, each with the pixels (N, 2) and labels (N,) of the points.
+
+        Args:
+            kind: of the images.
+            taken: (N,) points that need no sample any more, as they are when an image comes: none of them is OK there.
+        """
         scan = self._scan
         if kind is ChannelKind.INTENSITY and scan.amplitude is not None:
             # The range camera's own image: each point lies in its own pixel, and nothing there hides another.
@@ -113,10 +119,12 @@ class ImageTransfers:
         elif kind is ChannelKind.TEMPERATURE:
             images = dict(scan.thermal)
         for name, image in images.items():
-            transfer = self._transfer(name)
+            if taken.all():
+                return
+            transfer = self._transfer(name, taken)
             yield image, transfer.pixels, transfer.labels
 
-    def _transfer(self, name: str) -> Transfer:
+    def _transfer(self, name: str, taken: Flags) -> Transfer:
         """Transfer of all points into a camera's image; points with too uncertain a place there are so labelled."""
         src, limits = self._scan.range_camera, self._limits
         points = self._seen_points()
@@ -129,6 +137,8 @@ class ImageTransfers:
             steps_m=points.steps_m,
             hidden_behind_m=limits.hidden_behind_m,
         )
+        # Those that need no sample hide others, and are examined no further.
+        transfer.labels[taken & transfer.ok] = Label.NO_READING
         # Stage 2: the covariance of the place, only for points that a bound does not clear.
         certain = is_certain(points.range_m, points.sigma_m, self._rig, src=src, dst=name, limit_m=limits.spread_max_m)
         doubtful = np.nonzero(transfer.ok & ~certain)[0]
@@ -146,13 +156,14 @@ class ImageTransfers:
     def _seen_points(self) -> _Points:
         if self._points is None:
             mounted, returned = self._rig[self._scan.range_camera], self._returns.pixels
-            range_m = self._returns.range_m.ravel()[returned].astype(np.float64)
-            # Eq. 1-4 for the whole image, because a slant takes the pixels around; then only the points that count.
-            image_points = points_from_range(self._returns.range_m, mounted.camera)
+            image_m, rays = self._returns.range_m.astype(np.float64), mounted.camera.rays()
+            range_m = image_m.ravel()[returned]
+            # Eq. 1-4: of the points that count, and of the whole image only the depth, because a slant takes the pixels
+            # around.
             self._points = _Points(
-                tof=np.take(image_points.reshape(-1, 3), returned, axis=0),
+                tof=np.take(rays.reshape(-1, 3), returned, axis=0) * range_m[:, None],
                 range_m=range_m,
-                steps_m=depth_steps(image_points).ravel()[returned],
+                steps_m=steps_of(rays[..., 2] * image_m).ravel()[returned],
                 sigma_m=mounted.range_sigma_image(self._returns.range_m).ravel()[returned],
             )
         return self._points

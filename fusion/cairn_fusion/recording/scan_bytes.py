@@ -9,6 +9,7 @@ import json
 import math
 import struct
 from collections.abc import Mapping
+from copy import copy
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -121,21 +122,11 @@ def move_scan(scan: Scan, T_map_rig: Transform) -> Scan:
 def place_scan(scan: Scan, T_map_rig: Transform) -> Scan:
     """Give a scan the pose of one that was checked, bit for bit; the robot's body moves with the rig."""
     T_map_body = scan.T_map_body
-    moved = Scan(
-        time_s=scan.time_s,
-        T_map_rig=T_map_rig,
-        range_camera=scan.range_camera,
-        range_m=scan.range_m,
-        points_m=scan.points_m,
-        amplitude=scan.amplitude,
-        colour=scan.colour,
-        thermal=scan.thermal,
-        scalars=scan.scalars,
-    )
     # For an unchanged pose not even the last bit of the body's pose changes.
     same_pose = np.array_equal(T_map_rig, scan.T_map_rig)
     there = T_map_body if same_pose or T_map_body is None else T_map_rig @ inverse(scan.T_map_rig) @ T_map_body
-    return _with_poses(moved, T_map_rig, there)
+    # A copy is not checked again: both poses were, and the check takes as long as the decoding of a small scan.
+    return _with_poses(copy(scan), T_map_rig, there)
 
 
 def _arrays(scan: Scan) -> dict[tuple[str, str], Array]:

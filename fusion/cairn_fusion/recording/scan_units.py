@@ -45,7 +45,11 @@ def check_ranges(camera: str, range_m: npt.NDArray[np.float32]) -> None:
     Raises:
         BadInputError: kind `bad_units`, with the numbers and the likely unit.
     """
-    found = _median_of_some(range_m, least=0.0)
+    some = _some(range_m)
+    # No median exceeds what no number does, and of nearly every image none does.
+    if not (some > LONGEST_RANGE_M).any():
+        return
+    found = _median(some, least=0.0)
     if found is None or found <= LONGEST_RANGE_M:
         return
     known, beyond = int((range_m > 0).sum()), int((range_m > LONGEST_RANGE_M).sum())
@@ -62,7 +66,10 @@ def check_temperatures(camera: str, kelvin: npt.NDArray[np.float32]) -> None:
     Raises:
         BadInputError: kind `bad_units`, with the numbers and the likely unit.
     """
-    found = _median_of_some(kelvin, least=-np.inf)
+    some = _some(kelvin)
+    if not (some < COLDEST_K).any():
+        return
+    found = _median(some, least=-np.inf)
     if found is None or found >= COLDEST_K:
         return
     known, below = int(np.isfinite(kelvin).sum()), int((kelvin < COLDEST_K).sum())
@@ -73,8 +80,12 @@ def check_temperatures(camera: str, kelvin: npt.NDArray[np.float32]) -> None:
     )
 
 
-def _median_of_some(image: npt.NDArray[np.float32], *, least: float) -> float | None:
-    """Median of some of the image's pixels that are finite and above `least`; None if there are none."""
-    some = image.ravel()[:: max(1, image.size // LOOK_AT)]
+def _some(image: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """Some of an image's pixels, evenly spread."""
+    return image.ravel()[:: max(1, image.size // LOOK_AT)]
+
+
+def _median(some: npt.NDArray[np.float32], *, least: float) -> float | None:
+    """Median of the numbers that are finite and above `least`; None if there are none."""
     some = some[np.isfinite(some) & (some > least)]
     return float(np.median(some)) if len(some) else None

@@ -16,10 +16,10 @@ from cairn_fusion.ros.bag import MESSAGES_MAX, Bag, BagMessage, Topic, Wire
 from cairn_fusion.ros.images import encoding_of
 from cairn_fusion.ros.messages import (
     CAMERA_INFO,
+    CLOUDS,
     COMPRESSED,
     IMAGE,
     ODOMETRY,
-    POINTS,
     POSES,
     STAMPED,
     TRANSFORMS,
@@ -33,7 +33,7 @@ from cairn_fusion.ros.messages import (
     read_pose,
     read_transforms,
 )
-from cairn_fusion.ros.point_clouds import elevations_of, read_points
+from cairn_fusion.ros.point_clouds import elevations_of, read_cloud
 from cairn_fusion.ros.tf_tree import FrameTree
 from cairn_map.errors import BadInputError, DamagedDataError
 
@@ -95,8 +95,8 @@ class TopicIndex:
         elif self.topic.type == CAMERA_INFO:
             self.info = read_camera_info(message.data, wire)
             self.image_size = (self.info.width, self.info.height)
-        elif self.topic.type == POINTS:
-            points = read_points(message.data, wire)
+        elif self.topic.type in CLOUDS:
+            points = read_cloud(message.data, wire, type_name=self.topic.type)
             self.elevations_deg, self.image_size = elevations_of(points), (points.width, points.height)
             beams = len(self.elevations_deg or ()) or 1
             self.columns = -(-points.width * points.height // beams)

@@ -22,7 +22,7 @@ from cairn_fusion.recording.scan import Scan
 from cairn_fusion.ros.bag import Bag, BagMessage
 from cairn_fusion.ros.bag_index import BagIndex, TopicIndex, index_bag, wire_of
 from cairn_fusion.ros.bag_scans import scans_of
-from cairn_fusion.ros.messages import COMPRESSED, IMAGE, POINTS, TRANSFORMS
+from cairn_fusion.ros.messages import CLOUDS, COMPRESSED, IMAGE, TRANSFORMS
 from cairn_fusion.ros.open_bag import open_bag
 from cairn_fusion.ros.scan_decoder import ScanDecoder
 from cairn_fusion.ros.topic_mapping import BagMapping, MappedCamera, camera_of_info, mapping_from_yaml
@@ -166,7 +166,7 @@ def open_bag_recording(
 def image_topics(mapping: BagMapping) -> Iterator[tuple[str, str, tuple[str, ...]]]:
     """Topics of pixels and points, each with its camera and the types that it may have."""
     for name, camera in mapping.cameras.items():
-        yield camera.topic, name, (POINTS,) if camera.lidar else (IMAGE, COMPRESSED)
+        yield camera.topic, name, tuple(sorted(CLOUDS)) if camera.lidar else (IMAGE, COMPRESSED)
         if camera.amplitude is not None:
             yield camera.amplitude, name, (IMAGE, COMPRESSED)
 

@@ -112,13 +112,20 @@ def _scans_with_poses(
     )
 
 
+def others_of(mapping: BagMapping, camera: MappedCamera) -> list[str]:
+    """Topics of the images that go with those of a range camera; none with points that have no raster."""
+    if camera.is_loose:
+        return []
+    others = [other.topic for other in mapping.cameras.values() if other.spectrum is not Spectrum.RANGE]
+    return [*others, *([camera.amplitude] if camera.amplitude else [])]
+
+
 def images_near(
     mapping: BagMapping, camera: MappedCamera, lists: Mapping[str, TimedList[int]], time_s: float
 ) -> dict[str, int]:
     """The images of one scan: the range image itself, and the nearest of every other topic, earlier one of a tie."""
-    others = [other.topic for other in mapping.cameras.values() if other.spectrum is not Spectrum.RANGE]
     images = {camera.topic: lists[camera.topic].nearest(time_s, max_gap_s=0.0)}
-    for topic in [*others, *([camera.amplitude] if camera.amplitude else [])]:
+    for topic in others_of(mapping, camera):
         images[topic] = lists[topic].nearest(time_s, max_gap_s=mapping.time_tolerance_s)
     return {topic: n for topic, n in images.items() if n is not None}
 

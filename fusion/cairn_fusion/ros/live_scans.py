@@ -22,7 +22,7 @@ from cairn_calib.rig.rig import Spectrum
 from cairn_fusion.recording.timed_lists import TimedList
 from cairn_fusion.ros.bag import HELD_BYTES, BagMessage, Topic
 from cairn_fusion.ros.bag_index import BASE, STATIC_NAME, BagIndex, TopicIndex, translate_message_damage, wire_of
-from cairn_fusion.ros.bag_scans import BagScan, PoseAt, images_near, poses_of
+from cairn_fusion.ros.bag_scans import BagScan, PoseAt, images_near, others_of, poses_of
 from cairn_fusion.ros.live_frames import WINDOW_S, LiveFrames
 from cairn_fusion.ros.messages import (
     ODOMETRY,
@@ -35,7 +35,6 @@ from cairn_fusion.ros.messages import (
     read_pose,
     read_transforms,
 )
-from cairn_fusion.ros.scan_decoder import is_loose
 from cairn_fusion.ros.tf_tree import FrameTree
 from cairn_fusion.ros.topic_mapping import BagMapping, MappedCamera
 from cairn_map.errors import BadInputError, DamagedDataError
@@ -327,14 +326,9 @@ class LiveScans:
             else:
                 yield self._scan(pending, camera, way)
 
-    def _others(self, camera: MappedCamera) -> list[str]:
-        """Topics of the images that go with those of a range camera."""
-        others = [other.topic for other in self._mapping.cameras.values() if other.spectrum is not Spectrum.RANGE]
-        return [*others, *([camera.amplitude] if camera.amplitude else [])]
-
     def _has_others(self, camera: MappedCamera, time_s: float) -> bool:
         """True if no later image of another camera can be nearer."""
-        for topic in self._others(camera):
+        for topic in others_of(self._mapping, camera):
             images = self._images[topic]
             if not images.times_s:
                 return False
@@ -346,7 +340,7 @@ class LiveScans:
 
     def _way(self, camera: MappedCamera, time_s: float, *, is_overdue: bool) -> _Way | Cause | None:
         """The way of the robot around a time; None: more may come; a cause: it comes too late."""
-        reach_s = SWEEP_S if is_loose(camera) else 0.0
+        reach_s = SWEEP_S if camera.is_loose else 0.0
         span = time_s - reach_s, time_s + reach_s
         topic = self._topics[self._mapping.poses.topic]
         index = BagIndex(
@@ -393,7 +387,7 @@ class LiveScans:
 
     def _scan(self, pending: _Pending, camera: MappedCamera, way: _Way) -> ReadyScan:
         pose_at, first_s, last_s = way.pose_at, way.first_s, way.last_s
-        lists = {topic: self._images[topic].timed() for topic in (camera.topic, *self._others(camera))}
+        lists = {topic: self._images[topic].timed() for topic in (camera.topic, *others_of(self._mapping, camera))}
         numbers = images_near(self._mapping, camera, lists, pending.time_s)
         self.alone += len(numbers) < len(lists)
         messages = {topic: self._images[topic].messages[n] for topic, n in numbers.items()}

@@ -29,7 +29,10 @@ ODOMETRY = "nav_msgs/Odometry"
 POSES = frozenset(["geometry_msgs/PoseStamped", "geometry_msgs/PoseWithCovarianceStamped"])
 PATH = "nav_msgs/Path"
 POINTS = "sensor_msgs/PointCloud2"
-STAMPED = frozenset([IMAGE, COMPRESSED, CAMERA_INFO, ODOMETRY, POINTS]) | POSES
+LIVOX = frozenset(f"{package}/CustomMsg" for package in ("livox_ros_driver", "livox_ros_driver2", "livox_interfaces"))
+"""Clouds of Livox' own message, one definition in three packages."""
+CLOUDS = LIVOX | {POINTS}
+STAMPED = frozenset([IMAGE, COMPRESSED, CAMERA_INFO, ODOMETRY]) | POSES | CLOUDS
 """Types that begin with a header."""
 TRANSFORM_BYTES_MIN = 72
 """Time, two empty names, seven numbers."""
@@ -60,7 +63,7 @@ class WireReader:
             self._order = "<" if kind[1] else ">"
 
     def integer(self, code: str) -> int:
-        """A number of the `struct` codes B, H, i, I."""
+        """A number of the `struct` codes B, H, i, I, Q."""
         number: int = struct.unpack_from(self._order + code, self._data, self._take(struct.calcsize(code), 1))[0]
         return number
 
@@ -76,6 +79,24 @@ class WireReader:
             raise ValueError(f"a text of {size} bytes, at most {TEXT_BYTES_MAX} are read")
         raw = bytes(self._data[(start := self._take(1, size)) : start + size])
         return (raw.removesuffix(b"\0") if self._is_aligned else raw).decode("utf-8", "replace")
+
+    @property
+    def order(self) -> str:
+        """Order of the bytes of a number, as `struct` and NumPy name it."""
+        return self._order
+
+    def records(self, size: int) -> tuple[memoryview, int, int]:
+        """A sequence of structures without gaps inside: its bytes, their number, and the bytes from one to the next.
+
+        Args:
+            size: bytes of one, of which the first member is a number of four; in CDR the next one begins at a multiple
+                of four, so the last one is shorter than the step.
+        """
+        count = self.length(size)
+        step = -(-size // 4) * 4 if self._is_aligned else size
+        taken = max(0, (count - 1) * step + size) if count else 0
+        start = self._take(1, taken)
+        return self._data[start : start + taken], count, step
 
     def octets(self) -> memoryview:
         """A sequence of bytes, not copied."""

@@ -1,4 +1,4 @@
-"""Point clouds of lidars (`sensor_msgs/PointCloud2`): their points, and the beams that measured them.
+"""Point clouds of lidars (`sensor_msgs/PointCloud2`, Livox' `CustomMsg`): their points, and the beams of these.
 
 Points of known beams are taken to be moved to one time by the driver that published the cloud; those without rings are
 moved by their own times, where they have some (`clouds.deskew`).
@@ -13,11 +13,22 @@ from cairn_calib.rig.lidar import SpinningLidar
 from cairn_calib.rig.raster import MAX_SIDE_PX
 from cairn_fusion.clouds.sweep_image import R_LIDAR_CAMERA
 from cairn_fusion.ros.bag import Wire
-from cairn_fusion.ros.messages import RosHeader, WireReader, header_of
+from cairn_fusion.ros.messages import LIVOX, RosHeader, WireReader, header_of
 from cairn_map.errors import BadInputError
 
 FIELD_BYTES_MIN = 13
 FIELDS_MAX = 64
+LIVOX_FIELDS = {
+    "offset_time": (0, "u4"),
+    "x": (4, "f4"),
+    "y": (8, "f4"),
+    "z": (12, "f4"),
+    "reflectivity": (16, "u1"),
+    "tag": (17, "u1"),
+    "line": (18, "u1"),
+}
+"""Offset and NumPy type of each member of a `CustomPoint`; the time is nanoseconds from the header's."""
+LIVOX_POINT_BYTES = 19
 TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """NumPy types by the numbers of sensor_msgs/PointField."""
 STEP_MIN_DEG = 0.01
@@ -64,6 +75,30 @@ class RosPoints:
     def xyz(self) -> npt.NDArray[np.float64]:
         """(N, 3) metres, the cloud's frame; NaN where nothing came back."""
         return np.stack([self.column(axis).astype(np.float64) for axis in "xyz"], axis=-1)
+
+
+def read_cloud(data: bytes | memoryview, wire: Wire, *, type_name: str) -> RosPoints:
+    """The points of a message of one of the `CLOUDS`; ValueError for other bytes."""
+    return read_livox(data, wire) if type_name in LIVOX else read_points(data, wire)
+
+
+def read_livox(data: bytes | memoryview, wire: Wire) -> RosPoints:
+    """A `CustomMsg` of a Livox' driver, as its `PointCloud2` would be; ValueError for other bytes.
+
+    Its `timebase` is the header's time, or, of a lidar without synchronisation, that since its start: points' times
+    count from the header's.
+    """
+    reader = WireReader(data, wire)
+    header = header_of(reader, wire)
+    reader.integer("Q")  # timebase
+    reader.integer("I")  # point_num, which the length of the sequence says again
+    for _ in range(4):  # lidar_id, and three bytes of nothing
+        reader.integer("B")
+    octets, count, step = reader.records(LIVOX_POINT_BYTES)
+    # The last point may lack the bytes up to the next one.
+    whole = memoryview(bytes(octets).ljust(count * step, b"\0"))
+    fields = {name: (offset, reader.order + letter) for name, (offset, letter) in LIVOX_FIELDS.items()}
+    return RosPoints(header, count, min(count, 1), fields, step, count * step, whole)
 
 
 def read_points(data: bytes | memoryview, wire: Wire) -> RosPoints:

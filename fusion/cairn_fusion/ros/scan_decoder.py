@@ -30,8 +30,8 @@ from cairn_fusion.ros.bag_index import translate_message_damage, wire_of
 from cairn_fusion.ros.bag_scans import BagScan, PoseAt
 from cairn_fusion.ros.images import AnyImage, Pixels, amplitude_of, colour_of, depth_of, thermal_counts_of
 from cairn_fusion.ros.messages import IMAGE, read_compressed_image, read_image
-from cairn_fusion.ros.point_clouds import check_beams, read_points
-from cairn_fusion.ros.topic_mapping import BagMapping, LidarKind, MappedCamera
+from cairn_fusion.ros.point_clouds import check_beams, read_cloud
+from cairn_fusion.ros.topic_mapping import BagMapping, MappedCamera
 
 PixelsT = TypeVar("PixelsT", bound=Pixels)
 MessageOf = Callable[[str], BagMessage]
@@ -72,7 +72,7 @@ class ScanDecoder:
             T_map_rig=found.T_map_rig,
             range_camera=found.camera,
             range_m=self._range(own, found, message) if xyz is None else sweep_image(xyz, self._lidar(found.camera)),
-            points_m=None if xyz is None or not is_loose(own) else (xyz @ R_LIDAR_CAMERA).astype(np.float32),
+            points_m=None if xyz is None or not own.is_loose else (xyz @ R_LIDAR_CAMERA).astype(np.float32),
             amplitude=self._amplitude(own, found, message),
             colour={
                 name: self._pixels(camera.topic, message, colour_of)
@@ -96,11 +96,11 @@ class ScanDecoder:
         self, camera: MappedCamera, found: BagScan, message: MessageOf, pose_at: PoseAt | None
     ) -> npt.NDArray[np.float64]:
         """(N, 3) the points of a lidar's cloud, metres, its own frame; of a known lidar they must lie on its beams."""
-        sweep = message(camera.topic)
+        sweep, topic = message(camera.topic), self._topics[camera.topic]
         with translate_message_damage(self._source, sweep):
-            points = read_points(sweep.data, wire_of(self._topics[camera.topic]))
+            points = read_cloud(sweep.data, wire_of(topic), type_name=topic.type)
             xyz = points.xyz()
-        if not is_loose(camera):
+        if not camera.is_loose:
             check_beams(xyz, self._lidar(found.camera), found.camera)
             return xyz
         place = f"{self._source}: {camera.topic} at {found.time_s:.6f} s"
@@ -132,11 +132,6 @@ class ScanDecoder:
             read = read_image if self._topics[topic].type == IMAGE else read_compressed_image
             image = read(message.data, wire)
             return decode(image, f"{self._source}: {topic} at {message.log_ns / 1e9:.6f} s")
-
-
-def is_loose(camera: MappedCamera) -> bool:
-    """True if a topic's points have no raster."""
-    return camera.lidar is not None and camera.lidar.kind is LidarKind.CLOUD
 
 
 def _range_of(pixels: Pixels, camera: AnyCamera, mapped: MappedCamera) -> npt.NDArray[np.float32]:

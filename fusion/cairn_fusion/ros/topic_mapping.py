@@ -154,6 +154,11 @@ class MappedCamera(Model):
     kelvin_at_zero: Finite = 0.0
 
     @property
+    def is_loose(self) -> bool:
+        """True if the topic's points have no raster."""
+        return self.lidar is not None and self.lidar.kind is LidarKind.CLOUD
+
+    @property
     def range_encoding(self) -> RangeEncoding:
         """Coding of 16-bit range."""
         return RangeEncoding(units_per_m=self.units_per_m, convention=self.convention)

@@ -18,7 +18,7 @@ import numpy as np
 from cairn_calib.rig.rig import Spectrum
 from cairn_fusion.ros.bag_index import BASE, BagIndex, TopicIndex
 from cairn_fusion.ros.images import COLOURS
-from cairn_fusion.ros.messages import CAMERA_INFO, COMPRESSED, IMAGE, POINTS, TRANSFORMS
+from cairn_fusion.ros.messages import CAMERA_INFO, CLOUDS, COMPRESSED, IMAGE, TRANSFORMS
 from cairn_fusion.ros.tf_tree import FrameTree
 from cairn_fusion.ros.topic_mapping import DECIDE
 
@@ -44,10 +44,6 @@ PACKETS = {
     **dict.fromkeys(
         ("velodyne_msgs/VelodyneScan", "velodyne_msgs/VelodynePacket"),
         ("a Velodyne", "the node `velodyne_transform_node` of velodyne_pointcloud"),
-    ),
-    **dict.fromkeys(
-        ("livox_ros_driver/CustomMsg", "livox_ros_driver2/CustomMsg", "livox_interfaces/CustomMsg"),
-        ("a Livox", "its driver with xfer_format 0 (PointCloud2)"),
     ),
     **dict.fromkeys(
         ("rslidar_msg/RslidarPacket", "rslidar_msgs/rslidarScan", "rslidar_msgs/rslidarPacket"),
@@ -169,7 +165,7 @@ def _cameras(index: BagIndex, questions: list[str]) -> list[Guess]:
 
 def _lidars(index: BagIndex) -> list[Guess]:
     """Guesses for topics of point clouds that a lidar may have made."""
-    clouds = [e for e in index.topics.values() if e.topic.type == POINTS and len(e) and e.topic.wire is not None]
+    clouds = [e for e in index.topics.values() if e.topic.type in CLOUDS and len(e) and e.topic.wire is not None]
     found = [e for e in clouds if not CAMERA_WORDS.search(_word(e))]
     return [Guess(f"lidar{n or ''}", Spectrum.RANGE, entry, None) for n, entry in enumerate(found)]
 
@@ -265,7 +261,7 @@ def _camera_lines(camera: Guess, index: BagIndex) -> Iterator[str]:
     yield f"  {camera.name}:"
     yield f"    spectrum: {camera.spectrum.value}"
     yield f"    topic: {_quoted(camera.entry.topic.name)}  # {camera.entry.encoding}, {camera.entry.rate_hz:.3g} Hz"
-    if camera.entry.topic.type == POINTS:
+    if camera.entry.topic.type in CLOUDS:
         known = camera.entry.elevations_deg
         if known is None:
             yield "    lidar: {kind: cloud}  # neither rows nor rings tell its beams: each point is a beam of its own"

@@ -1,6 +1,7 @@
 """Clouds of a spinning lidar, in bags."""
 
-from collections.abc import Iterator
+import struct
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,10 @@ from rosbags.typesys import get_types_from_msg
 from tests.fixtures.fusion.bags import KINDS, ROS2, Messages, Timed, pose_of, write_bag
 from tests.fixtures.fusion.cloud_forms import beams, off_walls_m, pcd_binary, seen
 from tests.fixtures.fusion.cloud_forms import pose_of as room_pose
+from tests.fixtures.fusion.drive_mapping import MAPPING, mapping_text
+from tests.fixtures.fusion.live_drive import START_S as LIVE_START_S
+from tests.fixtures.fusion.live_drive import drive as live_drive
+from tests.fixtures.fusion.live_drive import in_bag_order
 from tests.fixtures.fusion.pose_forms import kitti
 
 from cairn_calib.rig.lidar import SpinningLidar
@@ -24,6 +29,7 @@ from cairn_fusion.ros.point_clouds import (
     RosPoints,
     check_beams,
     elevations_of,
+    read_livox,
     read_points,
 )
 from cairn_fusion.ros.topic_mapping import mapping_from_yaml
@@ -317,3 +323,82 @@ def test_points_of_a_bag_are_moved_by_their_times(tmp_path: Path) -> None:
     # Half a millimetre of the grid, and half a step of a millisecond.
     assert off_m[0].max() < 0.005
     assert (off_m[1] > 0.03).mean() > 0.2
+
+
+@pytest.mark.parametrize("kind", ["bag", "mcap"])
+def test_a_livox_cloud_of_its_own_message_is_that_of_its_driver_s_points(kind: str, tmp_path: Path) -> None:
+    sweeps = [seen(T, beams(20, seed=n)) for n, T in enumerate(POSES)]
+    sweeps[1][3:5] = 0.0  # what the driver writes where nothing came back
+    after_ns = np.arange(20, dtype=np.uint32) * 5_000_000
+
+    def messages(make: Messages, cloud_of: Callable[..., Any]) -> Iterator[Timed]:
+        yield START_S, "/tf_static", make.tf(make.transform(START_S, "base_link", "lidar", pose_of(np.eye(4))))
+        for n in range(40):
+            T = room_pose(0.03 * n, 0.04 * n)
+            yield START_S + n / 10, "/tf", make.tf(make.transform(START_S + n / 10, "odom", "base_link", pose_of(T)))
+        for n, points in enumerate(sweeps):
+            yield START_S + n + 0.01, "/livox/lidar", cloud_of(make, START_S + n + 0.01, points)
+
+    def own(make: Messages, time_s: float, points: np.ndarray[Any, np.dtype[np.float32]]) -> Any:
+        return make.livox(time_s, "lidar", points, after_ns)
+
+    def plain(make: Messages, time_s: float, points: np.ndarray[Any, np.dtype[np.float32]]) -> Any:
+        return loose_cloud(make, time_s, points, after_ns)
+
+    path = write_bag(tmp_path / "own", kind, lambda make: messages(make, own))
+    assert survey(path).proposal.questions == ()
+    assert "lidar: {kind: cloud}" in survey(path).proposal.text
+    scans = list(open_source(path))
+    expected = list(open_source(write_bag(tmp_path / "plain", kind, lambda make: messages(make, plain))))
+    assert len(scans) == len(expected) == 3
+    for scan, other in zip(scans, expected, strict=True):
+        assert scan.points_m is not None and other.points_m is not None
+        assert scan.points_m.tobytes() == other.points_m.tobytes()
+        assert scan.range_m.tobytes() == other.range_m.tobytes()
+
+
+def cdr(order: str) -> bytes:
+    """A Livox cloud of two points, written by hand; with one byte of padding between them."""
+    head = bytes([0, order == "<", 0, 0])
+    text = struct.pack(f"{order}iII3s", 1, 5, 3, b"ab\0") + b"\0"  # 16 bytes: `timebase` follows at once
+    numbers = struct.pack(f"{order}QI4BI", 7, 2, 1, 0, 0, 0, 2)
+    first, second = (struct.pack(f"{order}I3f3B", n, n + 0.5, -n, 2.0, 3, 16, n) for n in (1, 2))
+    return head + text + numbers + first + b"\0" + second
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_points_of_livox_are_read_in_either_order_of_bytes(order: str) -> None:
+    points = read_livox(cdr(order), Wire.CDR)
+    np.testing.assert_array_equal(points.xyz(), [[1.5, -1, 2], [2.5, -2, 2]])
+    assert points.column("offset_time").tolist() == [1, 2] and points.column("line").tolist() == [1, 2]
+    assert points.header.frame == "ab"
+    for cut in range(len(cdr(order))):
+        with pytest.raises(ValueError, match=r"ends early|elements are announced|plain CDR"):
+            read_livox(cdr(order)[:cut], Wire.CDR)
+
+
+def test_a_livox_cloud_that_announces_more_than_it_has_takes_no_memory() -> None:
+    huge = bytearray(cdr("<"))
+    huge[4 + 16 + 16 : 4 + 16 + 20] = b"\xff" * 4
+    with pytest.raises(ValueError, match="4294967295 elements are announced"):
+        read_livox(bytes(huge), Wire.CDR)
+    empty = cdr("<")[: 4 + 16 + 16] + bytes(4)
+    points = read_livox(empty, Wire.CDR)
+    assert points.xyz().shape == (0, 3) and elevations_of(points) is None
+
+
+def test_a_cloud_next_to_cameras_is_a_scan_without_their_images(tmp_path: Path) -> None:
+    points = np.random.default_rng(3).uniform(1, 4, (30, 3)).astype(np.float32)
+
+    def messages(make: Messages) -> Iterator[Timed]:
+        timed = [*live_drive(make, scans=5)]
+        timed += [(t, "/points", loose_cloud(make, t, points)) for t in LIVE_START_S + np.arange(4) / 10 + 0.03]
+        return in_bag_order(sorted(timed, key=lambda entry: entry[0]))
+
+    lidar = {"spectrum": "range", "topic": "/points", "lidar": {"kind": "cloud"}, "frame": "depth_frame"}
+    text = mapping_text(cameras={**MAPPING["cameras"], "lidar": lidar})  # type: ignore[dict-item]
+    scans = list(open_source(write_bag(tmp_path / "drive", "mcap", messages), mapping=mapping_from_yaml(text, "it")))
+    loose = [scan for scan in scans if scan.range_camera == "lidar"]
+    assert len(loose) == 4 and len(scans) > 7
+    assert not any(scan.colour or scan.thermal for scan in loose)
+    assert any(scan.colour for scan in scans if scan.range_camera == "depth")

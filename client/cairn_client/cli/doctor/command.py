@@ -1,4 +1,4 @@
-"""Check this installation, a state folder, and the way to a server.
+"""Check this installation, a state folder, the way to a server, and a live robot.
 
     $ cairn doctor http://127.0.0.1:8750/maps/lab
     ok    python        3.11.9 on x86_64
@@ -21,8 +21,13 @@
 Without an argument the installation alone is checked; with a server's or a map's URL, the way there as well, and the
 servers behind that address: whether they share one store, how many answer and fold, their versions and clocks. Further
 URLs, such as the servers' own behind a proxy, are compared with the first: all have to be of one store. With a
-state folder (of a robot, or of `cairn clone`), its content, and of a copy the way to its server. A line that is not
-`ok` has the next step below it. The exit code is 0 if nothing failed (there may be warnings), else 1.
+state folder (of a robot, or of `cairn clone`), its content, and of a copy the way to its server.
+
+With the door of a live robot (ws://HOST:PORT or another, see `cairn robot live --help`), its topics, poses and clock
+for some seconds, in the words of that command's status line; --topics is its topics file. Nothing is mapped.
+
+A line that is not `ok` has the next step below it. The exit code is 0 if nothing failed (there may be warnings), else
+1.
 """
 
 import json
@@ -45,8 +50,9 @@ from cairn_client.folders.state_folder import opened_replica
 from cairn_client.http.api import MapApi
 from cairn_client.http.map_url import split_map_url
 from cairn_client.http.origin_tokens import OriginTokens
+from cairn_client.live.live_source import SCHEMES, URL_HELP
 from cairn_client.robot.membership import own_token
-from cairn_map.errors import CairnError
+from cairn_map.errors import BadInputError, CairnError
 from cairn_map.evidence.grid import Geometry
 
 SOUND, ILL = 0, 1
@@ -55,13 +61,22 @@ SOUND, ILL = 0, 1
 def main(argv: list[str]) -> int:
     """Run the checks."""
     command = parser("cairn doctor", __doc__)
-    command.add_argument("target", nargs="?", metavar="URL|DIR", help="a server, a map, or a state folder")
+    command.add_argument(
+        "target", nargs="?", metavar="URL|DIR", help="a server, a map, a live robot's door, or a state folder"
+    )
     command.add_argument("others", nargs="*", metavar="URL", help="more addresses of the same servers")
+    command.add_argument("--topics", type=Path, metavar="YAML", help="of a live robot: meaning of the topics")
+    command.add_argument("--ca", type=Path, metavar="FILE", help="of a live robot: issuer of the certificate of wss://")
     command.add_argument("--json", action="store_true", help="print JSON")
     add_token(command)
     args = command.parse_args(argv)
     checks: list[Check] = []
-    for check in _checks(args.target, args.others, args.token):
+    target: str = args.target or ""
+    is_live = target.startswith(SCHEMES)
+    if not is_live and (args.topics or args.ca):
+        raise BadInputError("bad_option", f"--topics and --ca are of a live robot; {URL_HELP}")
+    found = _live(target, args.topics, args.ca) if is_live else _checks(args.target, args.others, args.token)
+    for check in found:
         checks.append(check)
         if not args.json:
             _show(check)
@@ -86,6 +101,17 @@ def _checks(target: str | None, others: list[str], tokens: OriginTokens) -> Iter
             server, name = split_map_url(link.url)
             with MapApi(server, token=token) as api:
                 yield grid_check(api, name, link.geometry)
+
+
+def _live(url: str, topics: Path | None, ca: Path | None) -> Iterator[Check]:
+    yield from installation_checks()
+    try:  # the other checks do without these libraries
+        from cairn_client.cli.doctor.live_checks import live_checks
+    except ModuleNotFoundError as exc:
+        advice = 'pip install "cairn-robotics[robot]"'
+        yield Check("live", CheckResult.FAIL, f"live robots need {exc.name}", advice)
+        return
+    yield from live_checks(url, topics, ca_file=ca)
 
 
 def _of_url(url: str, token: str | None, others: Sequence[tuple[str, str | None]] = ()) -> Iterator[Check]:

@@ -13,7 +13,7 @@ from cairn_client.cli.robot_arguments import gate_of, kept_scans_bytes, limits_o
 from cairn_client.cli.robots.replay import default_name, ensure_map
 from cairn_client.live.live_doors import open_door
 from cairn_client.live.live_mapping import LiveMapping
-from cairn_client.live.live_opening import OpenedLive, open_live, survey_live
+from cairn_client.live.live_opening import OpenedLive, mapping_for, open_live
 from cairn_client.live.live_source import LiveSource
 from cairn_client.live.live_status import LiveStatus, StatusWatch
 from cairn_client.live.path_corrections import PathCorrections
@@ -21,14 +21,12 @@ from cairn_client.live.scan_recorder import ScanRecorder
 from cairn_client.robot.robot import Robot
 from cairn_client.sync.responses import one_line
 from cairn_fusion.ros.scan_decoder import ScanDecoder
-from cairn_fusion.ros.topic_mapping import BagMapping, mapping_from_yaml, mapping_of
+from cairn_fusion.ros.topic_mapping import BagMapping
 from cairn_map.codec.cell_code import Profile
 from cairn_map.errors import USAGE, BadInputError, CairnError
 from cairn_map.evidence.channels import COLOUR, INTENSITY, TEMPERATURE, Channel
 from cairn_map.progress import StatusLine
 
-SURVEY_S = 3.0
-"""Time for which topics are listened to where no file names them."""
 TAKE_S = 0.1
 """Longest wait for messages."""
 TERMINAL_EVERY_S, LOG_EVERY_S, JSON_EVERY_S = 0.5, 10.0, 1.0
@@ -48,7 +46,7 @@ def run_live(args: argparse.Namespace) -> int:
             kept_bytes = kept_scans_bytes(args)
             if args.every <= 0:
                 raise BadInputError("bad_option", f"--every takes seconds above 0, got {args.every:g}")
-            mapping = _mapping(args)
+            mapping = mapping_for(args.source, args.topics, ca_file=args.ca)
             if mapping.corrections is not None and not kept_bytes:
                 raise BadInputError(
                     "bad_option",
@@ -82,24 +80,6 @@ def run_live(args: argparse.Namespace) -> int:
             sys.stderr.write(f"cairn robot live: {one_line(exc.message)} [{exc.kind}]\n")
             return USAGE
         return _map(args, source, mapping, opened, robot, recorder, stopping)
-
-
-def _mapping(args: argparse.Namespace) -> BagMapping:
-    """The mapping of the topics: that of the file, else the proposed one if it leaves no question open."""
-    if args.topics is not None:
-        return mapping_of(args.topics)
-    source = open_door(args.source, ca_file=args.ca)
-    try:
-        proposal = survey_live(source, seconds=SURVEY_S, on_message=lambda: None).proposal
-    finally:
-        source.close()
-    if proposal.questions:
-        raise BadInputError(
-            "undecided",
-            f"{args.source} leaves something to decide: {'; '.join(proposal.questions)}. Write a file by `cairn robot "
-            f"inspect {args.source} --output live.yaml`, edit it, and give it with --topics live.yaml",
-        )
-    return mapping_from_yaml(proposal.text, f"the topics proposed for {args.source}")
 
 
 def _corrections(mapping: BagMapping, opened: OpenedLive, robot: Robot) -> PathCorrections | None:
