@@ -113,10 +113,10 @@ class ImageTransfers:
         elif kind is ChannelKind.TEMPERATURE:
             images = dict(scan.thermal)
         for name, image in images.items():
-            transfer = self._transfer(name)
+            transfer = self.into(name)
             yield image, transfer.pixels, transfer.labels
 
-    def _transfer(self, name: str) -> Transfer:
+    def into(self, name: str) -> Transfer:
         """Transfer of all points into a camera's image; points with too uncertain a place there are so labelled."""
         src, limits = self._scan.range_camera, self._limits
         points = self._seen_points()
