@@ -3,6 +3,7 @@
 from random import Random
 
 from tests.fixtures.client.made import GEOMETRY
+from tests.fixtures.map.classed import CLASSED
 from tests.sync_sim.server import SimServer
 
 from cairn_map.epochs.layer import LayerDefinition, MapLayer
@@ -18,7 +19,7 @@ DEFINITIONS = tuple(
         epoch_s=120 if edge_um > 50_000 else None,
     )
     for edge_um in (10_000, 20_000, 200_000)
-)
+) + (LayerDefinition(name="named", geometry=CLASSED),)
 """One for each name: servers that are joined may define the same one, each by a commit of its own."""
 Layers = dict[str, MapLayer]
 

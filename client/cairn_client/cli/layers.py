@@ -138,7 +138,7 @@ def classes_from_text(text: str) -> Channel:
     except (OSError, ValueError) as exc:
         raise BadInputError(
             "bad_classes",
-            f"classes are names by commas (a letter, then a-z, 0-9, _), or a file of them: {text!r} is none",
+            f"classes are names by commas (a letter, then a-z, 0-9, _), or a file of them; got {text!r}",
         ) from exc
     names = [line.strip() for line in listed.splitlines()]
     return classes_channel(tuple(name for name in names if name and not name.startswith("#")))

@@ -45,7 +45,7 @@ class PixelCounts(NamedTuple):
 
 
 def classes_of_labels(scan: Scan, geometry: Geometry) -> dict[str, Ints]:
-    """Class numbers (H, W) of a scan's label images, `SILENT` where a label says nothing; of a map without classes none.
+    """Class numbers (H, W) of a scan's label images, `SILENT` where one says nothing; none of a map without classes.
 
     Raises:
         BadInputError: kind `unknown_class`: a name of the scan's table that the map's list lacks.

@@ -79,8 +79,8 @@ class Channel(BaseModel, frozen=True):
     zero: Annotated[float, Field(allow_inf_nan=False), AfterValidator(lambda value: value + 0.0)] = 0.0
     """Value of the sample 0; never -0.0, which is the same number with another digest."""
     classes: Annotated[tuple[ClassName, ...], Field(max_length=CLASSES_MAX, exclude_if=lambda names: not names)] = ()
-    """Names of the classes, in the order of their numbers, the last one `other`; of the kind `classes` alone. Other kinds
-    are written without the field: digests are over what is written, and readers of before refuse what is new."""
+    """Names of the classes, in the order of their numbers, the last one `other`; of the kind `classes` alone. Other
+    kinds are written without the field: digests are over what is written, and readers of before refuse what is new."""
 
     @model_validator(mode="after")
     def _classes_are_a_list(self) -> Self:
@@ -135,8 +135,7 @@ STANDARD_CHANNELS = (COLOUR, INTENSITY, TEMPERATURE)
 
 
 def planes_and_squares(channels: tuple[Channel, ...]) -> npt.NDArray[np.int64]:
-    """(channels, 3) planes of each channel, the number of those that are sums of squares, and 1 if its planes are votes
-    for classes, else 0: the form for kernels."""
+    """(channels, 3) planes of each channel, how many are sums of squares, 1 if they are votes for classes, else 0."""
     return _planes_and_squares(tuple((channel.kind, len(channel.planes)) for channel in channels))
 
 

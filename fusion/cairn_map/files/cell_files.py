@@ -8,6 +8,7 @@ import numpy.typing as npt
 from cairn_map.codec.view_code import encode_view
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.channels import ChannelKind
+from cairn_map.evidence.class_colours import class_colours
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey, Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
@@ -52,8 +53,8 @@ def ply_file(voxels: Voxels) -> bytes:
     Properties: x y z (float, metres, map frame), red green blue (uchar), probability (float), temperature (float,
     kelvin, NaN where no thermal camera looked), intensity (float), hits, misses (int); of a dated reading colour,
     temperature and intensity `_measured_s` (double, UTC seconds since 1970, NaN where unknown). Of a channel of classes
-    `class` (short, its number, -1 without votes) and `unsure` (uchar, 1 where it leads by less than two votes); a comment
-    for each class gives its number and its name.
+    `class` (short, its number, -1 without votes) and `unsure` (uchar, 1 where it leads by less than two votes); a
+    comment for each class gives its number and its name.
     """
     N = len(voxels)
     fields: list[tuple[str, str]] = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
@@ -90,7 +91,7 @@ def ply_file(voxels: Voxels) -> bytes:
 
 def npz_file(voxels: Voxels) -> bytes:
     """Voxels as a compressed NPZ: numbers, centres_m, counts, probability, and per channel mean, weight, spread,
-    and of a dated reading measured_s; of a channel of classes the mean is a number of `NAME_names`, and there is unsure.
+    and of a dated reading measured_s; of a channel of classes the mean is a number in `names`, and there is unsure.
     """
     arrays: dict[str, npt.NDArray[np.generic]] = {
         "numbers": voxels.numbers,
@@ -112,9 +113,12 @@ def npz_file(voxels: Voxels) -> bytes:
 
 
 def colours(voxels: Voxels) -> npt.NDArray[np.uint8]:
-    """(N, 3) uint8 sRGB; grey where no colour camera looked."""
-    reading = voxels.of_kind(ChannelKind.COLOUR)
+    """(N, 3) uint8 sRGB; grey where no colour camera looked. Of a map without colours, but with classes, theirs."""
+    reading, classes = voxels.of_kind(ChannelKind.COLOUR), voxels.of_kind(ChannelKind.CLASSES)
     rgb = np.full((len(voxels), 3), GREY, np.uint8)
+    if reading is None and classes is not None:
+        seen = classes.weight > 0
+        rgb[seen] = class_colours(len(classes.channel.classes))[classes.mean[seen].astype(np.int64)]
     if reading is not None:
         seen = reading.weight > 0
         rgb[seen] = np.rint(np.clip(reading.mean[seen], 0, 255))

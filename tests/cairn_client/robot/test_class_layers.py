@@ -80,36 +80,26 @@ def test_a_retract_takes_the_votes_out_again(server: LiveServer, tmp_path: Path)
         assert open_map(url).frozen.cells[0].packed() == before.packed()
 
 
-@pytest.mark.parametrize(
-    ("scan", "kind"),
-    [
-        (labelled(1, np.full((3, 4), 4, np.uint8)), "unknown_label"),
-        (labelled(1, label_names={0: None, 3: "wal", 9: "chair"}), "unknown_class"),
-        (labelled(1, np.zeros((4, 3), np.uint8)), "image_size"),
-        (labelled(1, np.zeros((3, 4), np.float32)), "bad_scan"),
-        (labelled(1, label_names={-1: "wall", **TABLE}), "bad_labels"),
-        (labelled(1, labels={"absent": np.zeros((3, 4), np.uint8)}), "unknown_camera"),
-    ],
-)
-def test_labels_that_fit_nothing_are_refused_and_nothing_is_lost(
-    server: LiveServer, tmp_path: Path, scan: Scan, kind: str
-) -> None:
+def test_labels_that_fit_nothing_are_refused_and_nothing_is_lost(server: LiveServer, tmp_path: Path) -> None:
     geometry = Geometry(voxel_edge_um=50_000, channels=(classes_channel(("wall", "chair")),))
     with Robot(RIG, server.map_url, directory=tmp_path / "mole", name="mole", geometry=geometry) as robot:
         robot.observe(labelled(1))
-        with pytest.raises(BadInputError) as refused:
-            robot.observe(scan)
-        assert refused.value.kind == kind
+        for scan, kind in (
+            (labelled(1, np.full((3, 4), 4, np.uint8)), "unknown_label"),
+            (labelled(1, label_names=TABLE | {3: "wal"}), "unknown_class"),
+            (labelled(1, np.zeros((4, 3), np.uint8)), "image_size"),
+        ):
+            with pytest.raises(BadInputError) as refused:
+                robot.observe(scan)
+            assert refused.value.kind == kind
         assert (commit := robot.commit()) is not None and len(commit.meta.scans) == 1
 
 
-@pytest.mark.parametrize(
-    "names", ["wall,wall", "Wall", "other,wall", "", ",".join(f"c{n}" for n in range(64)), "no/such/file"]
-)
-def test_classes_that_cannot_be_are_refused(server: LiveServer, tmp_path: Path, names: str) -> None:
-    options = ("--voxel", "0.05", "--classes", names)
-    said = cairn("map", "layer", "add", server.map_url, "things", *options, folder=tmp_path, code=1)
-    assert "bad_classes" in said
+def test_classes_that_cannot_be_are_refused(server: LiveServer, tmp_path: Path) -> None:
+    for names in ("wall,wall", "2nd", "other,wall", "", ",".join(f"c{n}" for n in range(64)), "no/such/file"):
+        options = ("--voxel", "0.05", "--classes", names)
+        said = cairn("map", "layer", "add", server.map_url, "things", *options, folder=tmp_path, code=1)
+        assert "bad_classes" in said
     with MapApi(server.url) as api:
         assert [layer.name for layer in api.layers(MAP)] == ["evidence"]
 

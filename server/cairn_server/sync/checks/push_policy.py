@@ -168,7 +168,7 @@ def _excess(
         return f"{counts} counts in one voxel"
     for channel in geometry.channels:
         weight = int(tops[1 + geometry.planes_of(channel.name).stop])
-        # One sample of weight 1 a scan, as there is one count (decision 002); of classes one vote a camera (decision 042).
+        # One sample of weight 1 a scan, as there is one count (decision 002); of classes one vote a camera (042).
         if weight > (VOTE_MAX * cameras if channel.classes else scans):
             return f"weight {weight} of {channel.name} in one voxel"
     # Weights are at most 2^12 here and a square below 2^40, so that the products fit.
