@@ -1,9 +1,12 @@
 """A layer of classes, end to end: defined on the command line, counted from label images, folded, read and exported."""
 
+import io
 import json
 from dataclasses import replace
 from pathlib import Path
 
+import httpx
+import laspy
 import numpy as np
 import pytest
 from tests.fixtures.client.live_server import LiveServer
@@ -14,12 +17,15 @@ from tests.fixtures.commands import cairn
 from cairn_client.folders.map_folder import open_layers, open_map
 from cairn_client.http.api import MapApi
 from cairn_client.robot.robot import Robot
+from cairn_fusion.recording.recording_writer import RecordingWriter
 from cairn_fusion.recording.scan import Scan
 from cairn_map.errors import BadInputError, ConflictError
 from cairn_map.evidence.channels import Channel, classes_channel
+from cairn_map.evidence.class_colours import class_colours
 from cairn_map.evidence.grid import Geometry
 from cairn_map.wire.layer_messages import AddLayer
 
+FORMS = ("npz", "ply", "pcd", "laz")
 TABLE = {0: None, 3: "wall", 7: "other", 9: "chair"}
 
 
@@ -62,6 +68,54 @@ def test_labels_of_scans_become_classes_that_anyone_asks_for(server: LiveServer,
     readings = [each["readings"]["classes"] for each in said]
     assert [each and each["class"] for each in readings] == found.class_names[:3]
     assert [each and each["unsure"] for each in readings] == found.unsure[:3].tolist()
+
+
+def test_a_layer_of_classes_is_drawn_saved_and_told_apart_by_old_clients(server: LiveServer, tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "labelled", RIG, name="labelled") as recording:
+        for seed in (1, 2):
+            recording.add(labelled(seed))
+    url = add_layer(server, tmp_path, "--classes", "wall,chair")
+    cairn("robot", "replay", "labelled", "--map", url, "--name", "mole", folder=tmp_path)
+    snapshot = open_map(url)
+    points = snapshot.occupied_in().centres_m
+    found = snapshot.class_at(points)
+    assert {"wall", "chair"} <= set(found.class_names)
+
+    # Files: a column of numbers, and their names.
+    cairn("map", "export", url, "--ply", "things.ply", "--npz", "things.npz", folder=tmp_path)
+    assert b"comment class 1 chair\n" in (tmp_path / "things.ply").read_bytes()
+    with np.load(tmp_path / "things.npz") as saved:
+        names, numbers = saved["classes_names"], saved["classes_mean"]
+        assert {names[int(number)] for number in numbers[~np.isnan(numbers)]} == {*found.class_names} - {None}
+    # The server's own files of a part: the same, and in the colours of the classes.
+    files = {form: httpx.get(f"{url}/main/export", params={"format": form}).content for form in FORMS}
+    rows = np.load(io.BytesIO(files["npz"]))["points"]
+    again = snapshot.class_at(np.stack([rows[axis] for axis in "xyz"], axis=1))
+    assert np.array_equal(rows["class"], again.mean.astype(np.float32), equal_nan=True)
+    assert again.unsure is not None and rows["unsure"].tolist() == again.unsure.tolist()
+    drawn, is_known = np.stack([rows[name] for name in ("red", "green", "blue")], axis=1), again.weight > 0
+    assert (drawn[is_known] == class_colours(3)[again.mean[is_known].astype(int)]).all()
+    assert b"comment class 1 chair\n" in files["ply"] and b"# class 1 chair\n" in files["pcd"]
+    laz = laspy.read(io.BytesIO(files["laz"]))
+    assert np.array_equal(laz["class"], rows["class"], equal_nan=True)
+    # A picture in their colours, and one voxel.
+    eye, target = ((points[0] + step).tolist() for step in ([0.0, 0.0, 1.0], [0.0, 0.0, 0.0]))
+    where = ("--from", ",".join(map(str, eye)), "--to", ",".join(map(str, target)), "--size", "32x24")
+    cairn("map", "render", url, *where, "--layer", "colour", "-o", "view.png", "--npz", "view.npz", folder=tmp_path)
+    with np.load(tmp_path / "view.npz") as saved:
+        seen = saved["colour"].reshape(-1, 3)
+    assert {*map(tuple, seen[~np.isnan(seen[:, 0])].astype(int).tolist())} <= {*map(tuple, class_colours(3).tolist())}
+    at = ",".join(f"{value:.9f}" for value in points[0])
+    (reading,) = httpx.get(f"{url}/main/voxels", params={"at": at}).json()["channels"]
+    assert (reading.get("class_name"), reading["kind"]) == (found.class_names[0], "classes")
+
+    # Clients that know no classes are not shown what they cannot read.
+    for known, names in (("4", {MAP}), ("5", {MAP, f"{MAP}.things"})):
+        headers = {"Cairn-Format": known}
+        listed = httpx.get(f"{server.url}/maps", headers=headers).json()
+        assert {each["name"] for each in listed} == names
+        layers = httpx.get(f"{server.map_url}/layers", headers=headers).json()
+        assert {each["map"] for each in layers} == names
 
 
 def test_a_retract_takes_the_votes_out_again(server: LiveServer, tmp_path: Path) -> None:
