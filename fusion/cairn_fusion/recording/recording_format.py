@@ -100,8 +100,8 @@ class RecordingHeader(BaseModel):
     colour: tuple[str, ...] = ()
     thermal: dict[str, ThermalEncoding] = Field(default_factory=dict)
     labels: Annotated[dict[str, LabelTable], Field(exclude_if=lambda tables: not tables)] = {}
-    """Of each camera with label images the class of each number; null: such a pixel says nothing. Readers of before
-    refuse the field, and so it is written only where there are labels."""
+    """Class of each number in each camera's label images; null: such a pixel says nothing. Written only where there are
+    labels, for older readers refuse the field."""
     max_gap_s: Seconds = 0.0
     """Largest time between the range image and another camera's image, seconds; 0: the same time stamp."""
     max_pose_gap_s: Seconds = 0.0

@@ -209,9 +209,9 @@ class RecordingWriter:
             write_grey16(self.folder / "images" / folder / name, image)
         for folder, colour in scan.colour.items():
             write_colour(self.folder / "images" / folder / name, colour)
-        labels = {f"{labelled}.labels": image for labelled, image in scan.labels.items()}
-        for folder, image in labels.items():
-            write_labels(self.folder / "images" / folder / name, image)
+        labels = {f"{camera_name}.labels": numbers for camera_name, numbers in scan.labels.items()}
+        for folder, numbers in labels.items():
+            write_labels(self.folder / "images" / folder / name, numbers)
         self._label_table = dict(scan.label_names) if scan.labels else self._label_table
         self._recorded |= dict.fromkeys(("labels", labelled) for labelled in scan.labels)
         self._recorded["range", scan.range_camera] = None

@@ -13,6 +13,7 @@ instead of samples: one of weight 1 to 4 for a voxel, camera and commit (decisio
 plane: its votes are the weight less those of the others.
 """
 
+import colorsys
 from enum import StrEnum
 from functools import lru_cache
 from typing import Annotated, Self
@@ -64,6 +65,12 @@ OTHER = "other"
 """The last class of each list: all that is of none of the others."""
 VOTE_MAX = 4
 """Largest weight of one vote: that of a voxel, a camera and a commit."""
+GOLDEN_TURN = 0.6180339887498949
+"""Golden angle, in turns: multiples of it are spread over the circle evenly, however many there are."""
+SHADES = (0.95, 0.75, 0.55)
+"""Brightness of three classes in turn, 0 to 1."""
+OTHER_GREY = 150
+"""Red, green and blue of `other`, and of no class that has a hue."""
 ClassName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,31}$")]
 
 
@@ -80,7 +87,7 @@ class Channel(BaseModel, frozen=True):
     """Value of the sample 0; never -0.0, which is the same number with another digest."""
     classes: Annotated[tuple[ClassName, ...], Field(max_length=CLASSES_MAX, exclude_if=lambda names: not names)] = ()
     """Names of the classes, in the order of their numbers, the last one `other`; of the kind `classes` alone. Other
-    kinds are written without the field: digests are over what is written, and readers of before refuse what is new."""
+    kinds are written without the field: digests are over what is written, and older readers refuse what is new."""
 
     @model_validator(mode="after")
     def _classes_are_a_list(self) -> Self:
@@ -157,3 +164,20 @@ def classes_channel(names: tuple[str, ...], *, name: str = "classes") -> Channel
         return Channel(kind=ChannelKind.CLASSES, name=name, classes=listed)
     except ValidationError as exc:
         raise BadInputError("bad_classes", f"the classes cannot be: {first_error(exc)}") from exc
+
+
+def class_colours(count: int) -> npt.NDArray[np.uint8]:
+    """(count, 3) sRGB 0 to 255 by which the classes of a channel are drawn, the last one `other`, in grey.
+
+    Neighbouring numbers are far apart in hue, and differ in brightness; a longer list keeps the colours of its first.
+    """
+    colours: npt.NDArray[np.uint8] = _hues()[:count].copy()
+    colours[-1:] = OTHER_GREY
+    return colours
+
+
+@lru_cache(maxsize=1)
+def _hues() -> npt.NDArray[np.uint8]:
+    found = [colorsys.hsv_to_rgb(n * GOLDEN_TURN % 1.0, 0.8, SHADES[n % len(SHADES)]) for n in range(CLASSES_MAX)]
+    colours: npt.NDArray[np.uint8] = np.rint(np.array(found) * 255).astype(np.uint8)
+    return colours

@@ -16,8 +16,7 @@ import numpy.typing as npt
 
 from cairn_map.arrays import Floats, Ints
 from cairn_map.errors import BadInputError
-from cairn_map.evidence.channels import Channel, ChannelKind
-from cairn_map.evidence.class_colours import class_colours
+from cairn_map.evidence.channels import Channel, ChannelKind, class_colours
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.inverse_sensor_model import LOG_ODDS_STEP, SensorModel, log_odds

@@ -7,8 +7,7 @@ import numpy.typing as npt
 
 from cairn_map.codec.view_code import encode_view
 from cairn_map.errors import BadInputError
-from cairn_map.evidence.channels import ChannelKind
-from cairn_map.evidence.class_colours import class_colours
+from cairn_map.evidence.channels import ChannelKind, class_colours
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey, Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel

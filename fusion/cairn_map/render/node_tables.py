@@ -15,8 +15,7 @@ import numpy.typing as npt
 
 from cairn_map.arrays import Floats, Ints, Words32
 from cairn_map.evidence.brick_cell import BrickCell
-from cairn_map.evidence.channels import Channel, ChannelKind
-from cairn_map.evidence.class_colours import class_colours
+from cairn_map.evidence.channels import Channel, ChannelKind, class_colours
 from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel, known
 from cairn_map.evidence.voxels import reading_of_sums

@@ -20,8 +20,7 @@ from cairn_client.robot.robot import Robot
 from cairn_fusion.recording.recording_writer import RecordingWriter
 from cairn_fusion.recording.scan import Scan
 from cairn_map.errors import BadInputError, ConflictError
-from cairn_map.evidence.channels import Channel, classes_channel
-from cairn_map.evidence.class_colours import class_colours
+from cairn_map.evidence.channels import Channel, class_colours, classes_channel
 from cairn_map.evidence.grid import Geometry
 from cairn_map.wire.layer_messages import AddLayer
 

@@ -10,8 +10,7 @@ from cairn_map.epochs.epoch import BASE, Epoch
 from cairn_map.epochs.present import present
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.brick_cell import brick_cell, difference, sum_evidence
-from cairn_map.evidence.channels import CLASSES_MAX, COLOUR, Channel, ChannelKind, classes_channel
-from cairn_map.evidence.class_colours import class_colours
+from cairn_map.evidence.channels import CLASSES_MAX, COLOUR, Channel, ChannelKind, class_colours, classes_channel
 from cairn_map.evidence.evidence import every_sum_has_weight, packed_evidence
 from cairn_map.evidence.fingerprint import fingerprint
 from cairn_map.evidence.grid import CellKey, Geometry, cell_key

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from cairn_map.arrays import Ints
 from cairn_map.codec.octree.streams import column_planes, encode_column, required
-from cairn_map.codec.octree.vote_kernels import place_votes_into
+from cairn_map.codec.octree.sum_kernels import place_votes_into
 from cairn_map.codec.octree.word_columns import words
 from cairn_map.errors import DamagedDataError
 from cairn_map.evidence.evidence import SUM_MAX
