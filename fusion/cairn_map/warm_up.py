@@ -21,7 +21,7 @@ from cairn_map.epochs.epoch import BASE, Epoch
 from cairn_map.epochs.present import present
 from cairn_map.errors import BadInputError, NotFoundError
 from cairn_map.evidence.brick_cell import brick_cell, reading_cell
-from cairn_map.evidence.channels import planes_and_squares
+from cairn_map.evidence.channels import classes_channel, planes_and_squares
 from cairn_map.evidence.compact_cell import HeldCell
 from cairn_map.evidence.evidence import (
     COUNT_MAX,
@@ -50,6 +50,7 @@ from cairn_map.render.render_picture import SCALES, Layer
 NICE = 10
 """Niceness of the processes that share the warm-up: work that is being done comes first."""
 GEOMETRY = Geometry(depth=BRICK_DEPTH)
+CLASSED = Geometry(depth=BRICK_DEPTH, channels=(classes_channel(("any",)),))
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +87,8 @@ def warm_up_codec() -> None:
         for c in range(len(GEOMETRY.channels)):
             reader.channel(c)
         reader.bricks(0, 1)
+    votes = packed_evidence(np.zeros(1, np.uint32), np.ones((1, 2), np.int32), np.ones((1, 2), np.int64), CLASSED)
+    cell_reader(encode_cell(_key(), votes, CLASSED).data).channel(0)
 
 
 def warm_up_sums() -> None:
@@ -137,7 +140,7 @@ SERVER_PARTS = {
     "pictures": warm_up_pictures,
 }
 """Parts that a server needs, the longest first (19, 8, 7 and 5 s of a core), so that processes may share them."""
-SERVER_KERNELS = 64
+SERVER_KERNELS = 65
 """Kernels that these parts compile, not counting those that others call."""
 CHECK_PARTS = ("models", "codec", "sums")
 """Those of them that a check of commits needs."""

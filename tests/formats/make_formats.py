@@ -23,7 +23,7 @@ from cairn_map.commits.mark import make_mark
 from cairn_map.epochs.cell_history import CellHistory, cell_history, history_fingerprint
 from cairn_map.epochs.epoch import BASE, Epoch
 from cairn_map.epochs.layer import LayerDefinition, MapLayer
-from cairn_map.evidence.channels import COLOUR, INTENSITY, TEMPERATURE, Channel, ChannelKind
+from cairn_map.evidence.channels import COLOUR, INTENSITY, TEMPERATURE, Channel, ChannelKind, classes_channel
 from cairn_map.evidence.evidence import Evidence, empty_evidence, packed_evidence
 from cairn_map.evidence.fingerprint import fingerprint
 from cairn_map.evidence.grid import Geometry, cell_key
@@ -32,12 +32,15 @@ from cairn_map.wire.messages import Done, More, ReplyHeader
 
 CELLS = ("v1-all-channels.cell", "v1-signed.cell", "v1-empty.cell", "v1-small.cell")
 
+CLASS_CELL = "v1-classes.cell"
+
 EPOCH_CELLS = ("v2-fast.cell", "v2-small.cell")
 
 FOLDER = Path(__file__).parent
 DOSE = Channel(kind=ChannelKind.SCALAR, name="dose", unit="µSv/h", step=0.01, zero=-1.5)
 SCALARS = tuple(Channel(kind=ChannelKind.SCALAR, name=name, unit="u", step=1.0) for name in ("a", "b"))
 GEOMETRY = Geometry(voxel_edge_um=40_000, depth=4, channels=(COLOUR, INTENSITY, TEMPERATURE, DOSE))
+CLASSED = Geometry(voxel_edge_um=50_000, depth=4, channels=(classes_channel(("wall", "floor", "chair")),))
 LAYER = MapLayer(geometry=GEOMETRY, epoch_s=120)
 KEY = cell_key((-3, 2, 0))
 AUTHOR = "mole.0123456789abcdef"
@@ -76,6 +79,15 @@ def wall() -> Evidence:
     )
     places = [interleave(*voxel) for voxel in zip(x.tolist(), y.tolist(), z.tolist(), strict=True)]
     return packed_evidence(np.array(places, np.uint32), counts, samples, GEOMETRY)
+
+
+def classes() -> Evidence:
+    """Votes for four classes on a floor, some for two of them, some for `other` alone."""
+    places = np.arange(0, 4096, 41)
+    n = np.arange(len(places))
+    first, second = np.where(n % 3, 1 + n % 4, 0), np.where(n % 5, 0, 300)
+    samples = np.stack([first, second, 0 * n, first + second + n % 2], axis=1)
+    return packed_evidence(places.astype(np.uint32), np.ones((len(places), 2), np.int32), samples, CLASSED)
 
 
 def commit_bytes() -> bytes:
@@ -167,6 +179,7 @@ def made() -> dict[str, bytes]:
         "v1-small.cell": encode_cell(KEY, wall(), GEOMETRY, profile=Profile.SMALL).data,
         "v1-signed.cell": encode_cell(KEY, evidence(-1), GEOMETRY).data,
         "v1-empty.cell": encode_cell(KEY, empty_evidence(GEOMETRY), GEOMETRY).data,
+        CLASS_CELL: encode_cell(KEY, classes(), CLASSED).data,
         "v1.commit": commit_bytes(),
         "v1.reply": reply_bytes(),
         "v2-fast.cell": encode_history(KEY, history(), LAYER).data,
@@ -235,6 +248,16 @@ def found_with_layer() -> dict[str, object]:
     return {"commit": {"sha": commit.sha.hex(), "meta": json.loads(commit.meta.model_dump_json())}}
 
 
+def found_with_classes() -> dict[str, object]:
+    """Content of the stored bytes of a cell of classes, as it is read today."""
+    cell = decode_cell((FOLDER / CLASS_CELL).read_bytes())
+    return {
+        "geometry": cell.geometry.digest().hex(),
+        "digest": cell.digest.hex(),
+        "fingerprint": fingerprint(cell.evidence, cell.key).hex(),
+    }
+
+
 def main() -> None:
     """Write what is missing."""
     for name, data in made().items():
@@ -252,6 +275,8 @@ def main() -> None:
         (FOLDER / "v3-attachment.json").write_text(
             json.dumps(found_with_attachments(), indent=1, sort_keys=True) + "\n"
         )
+    if not (FOLDER / "v1-classes.json").exists():
+        (FOLDER / "v1-classes.json").write_text(json.dumps(found_with_classes(), indent=1, sort_keys=True) + "\n")
 
 
 if __name__ == "__main__":

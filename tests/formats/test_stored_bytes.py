@@ -5,14 +5,18 @@ import json
 import pytest
 from tests.formats.make_formats import (
     CELLS,
+    CLASS_CELL,
+    CLASSED,
     EPOCH_CELLS,
     FOLDER,
     GEOMETRY,
     KEY,
     LAYER,
+    classes,
     evidence,
     found,
     found_with_attachments,
+    found_with_classes,
     found_with_epochs,
     found_with_layer,
     found_with_marks,
@@ -77,3 +81,10 @@ def test_stored_bytes_with_marks_still_mean_what_they_meant() -> None:
 
 def test_the_stored_definition_of_a_layer_still_means_what_it_meant() -> None:
     assert found_with_layer() == json.loads((FOLDER / "v4.json").read_text())
+
+
+def test_the_stored_cell_of_classes_still_means_what_it_meant() -> None:
+    assert found_with_classes() == json.loads((FOLDER / "v1-classes.json").read_text())
+    decoded = decode_canonical_cell((FOLDER / CLASS_CELL).read_bytes())
+    assert (decoded.key, decoded.geometry, decoded.evidence) == (KEY, CLASSED, classes())
+    assert encode_cell(KEY, classes(), CLASSED).digest == decoded.digest

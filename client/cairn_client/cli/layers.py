@@ -8,14 +8,23 @@
     evidence                  4 cm   5.12 m     56   12.4 MB  http://127.0.0.1:8750/maps/lab
     fine                      1 cm   1.28 m      0       0 B  http://127.0.0.1:8750/maps/lab.fine
 
+    $ cairn map layer add http://127.0.0.1:8750/maps/lab things --voxel 0.05 --classes wall,floor,chair
+    layer things of map lab: voxels of 5 cm, cells of 3.2 m, channels classes, epochs of 120 s
+    classes wall, floor, chair, other
+
 A map begins with one layer, `evidence`, and has at most 16. Each is pushed to, fetched, queried, drawn and exported
 under its own URL, by every command that takes a map's: MAP.LAYER. Robots' names, tokens, marks and the sensor model are
 those of the map. A definition is a commit: relays carry it, and it never changes; another definition under the same
 name is refused (`other_layer`), also on a server that is joined later. It takes an operator's token to add one.
+
+A layer with --classes counts what label images show (RECORDING.md; `labels` of a scan): names of at most 63 classes,
+by commas or one a line in a file, to which `other` is added. They are fixed with the layer: more are another layer.
 """
 
 import argparse
 import json
+import re
+from pathlib import Path
 
 from pydantic import ValidationError
 
@@ -32,8 +41,13 @@ from cairn_client.cli.arguments import (
     shown_length,
 )
 from cairn_map.errors import BadInputError, first_error
+from cairn_map.evidence.channels import Channel, classes_channel
 from cairn_map.evidence.grid import geometry_for
 from cairn_map.wire.layer_messages import AddLayer, LayerInfo
+
+CLASSES_TEXT_MAX = 1 << 16
+"""Characters of a file of classes that are read."""
+CLASS_NAMES = re.compile(r"[a-z0-9_,]+")
 
 
 def add_parser(commands: Subparsers) -> None:
@@ -51,6 +65,7 @@ def _add_add(commands: Subparsers) -> None:
     add.add_argument("name", help="its name: a letter, then a-z, 0-9 and _, at most 32")
     add.add_argument("--voxel", type=float, required=True, metavar="METRES", help="voxel edge, 0.001 to 1")
     add.add_argument("--channels", help="colour,intensity,temperature, scalars as NAME:UNIT:STEP (those of the map)")
+    add.add_argument("--classes", metavar="NAMES|FILE", help="names of classes that label images show, at most 63")
     add.add_argument("--epoch", metavar=f"SECONDS|{NO_EPOCHS}", help=f"{EPOCH_HELP} (that of the map)")
     add.add_argument("--json", action="store_true", help="print JSON")
 
@@ -64,7 +79,10 @@ def _add(args: argparse.Namespace) -> int:
     api, name = api_of(args.map, args.token)
     with api:
         info = api.map_info(name)
-        channels = info.geometry.channels if args.channels is None else channels_from_text(args.channels)
+        if args.classes is not None:
+            channels = (*channels_from_text(args.channels or ""), classes_from_text(args.classes))
+        else:
+            channels = info.geometry.channels if args.channels is None else channels_from_text(args.channels)
         geometry = geometry_for(voxel_edge_m=args.voxel, channels=channels)
         epoch_s = epoch_s_from_text(args.epoch, otherwise=info.epoch_s)
         try:
@@ -82,6 +100,9 @@ def _add(args: argparse.Namespace) -> int:
         f"layer {layer.name} of map {name}: voxels of {shown_length(layer.geometry.voxel_edge_m)}, "
         f"cells of {layer.geometry.cell_edge_m:g} m, channels {names}{epochs}"
     )
+    for channel in layer.geometry.channels:
+        if channel.classes:
+            say(f"classes {', '.join(channel.classes)}")
     say(f"robots map into it at {_url(args.map, name, layer)}")
     return 0
 
@@ -100,6 +121,27 @@ def _list(args: argparse.Namespace) -> int:
         url = _url(args.map, name, layer)
         say(f"{layer.name:<20} {voxel:>9} {cell:>8} {layer.cells:>6} {size:>9}  {url}")
     return 0
+
+
+def classes_from_text(text: str) -> Channel:
+    """Channel of classes of a text such as `wall,floor`, or of a file with one name a line, `#` before comments.
+
+    Raises:
+        BadInputError: kind `bad_classes`: the names cannot be, or the file cannot be read.
+    """
+    path = Path(text)
+    if CLASS_NAMES.fullmatch(text) and not path.is_file():
+        return classes_channel(tuple(text.split(",")))
+    try:
+        with path.open(encoding="utf-8") as file:
+            listed = file.read(CLASSES_TEXT_MAX)
+    except (OSError, ValueError) as exc:
+        raise BadInputError(
+            "bad_classes",
+            f"classes are names by commas (a letter, then a-z, 0-9, _), or a file of them; got {text!r}",
+        ) from exc
+    names = [line.strip() for line in listed.splitlines()]
+    return classes_channel(tuple(name for name in names if name and not name.startswith("#")))
 
 
 def _url(map_url: str, name: str, layer: LayerInfo) -> str:

@@ -2,6 +2,7 @@
 
     returns  points of the map, and the clear length of each beam    Eq. 1-5    `beam_returns`
     samples  colour and temperature of these points                  Eq. 5-6    `samples`
+    votes    classes of label images, one vote for each voxel and camera         `class_votes`
     counts   hits where beams ended, misses where the image looks through       `free_space`, `brick_tally`
              for lidars, ray by ray                                             `ray_casting`
     pack     evidence by cell
@@ -27,13 +28,15 @@ from cairn_calib.rig.poses import Transform, check_transform, inverse, transform
 from cairn_calib.rig.rig import LIDAR, LIDAR_REACH_M, TIME_OF_FLIGHT_REACH_M, MountedCamera, Rig
 from cairn_fusion.mapping.beam_returns import ReturnCounts, Returns, clear_image, returns_of
 from cairn_fusion.mapping.brick_tally import Each, TallyPool
+from cairn_fusion.mapping.class_votes import ClassVotes, classes_of_labels
 from cairn_fusion.mapping.free_space import Window, carving_of, window_of
 from cairn_fusion.mapping.ray_casting import beam_evidence, carried, clear_ends, silent_ends
-from cairn_fusion.mapping.samples import sample_sums
+from cairn_fusion.mapping.samples import ImageTransfers, SampleLimits, sample_sums
 from cairn_fusion.recording.scan import Scan, check_scan
 from cairn_fusion.transfer.transfer import DEPTH_TOLERANCE_M
 from cairn_map.arrays import Floats, Ints
 from cairn_map.errors import BadInputError
+from cairn_map.evidence.brick_cell import sum_evidence
 from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.evidence import Evidence, packed_evidence
 from cairn_map.evidence.grid import CellKey, Geometry, split_voxels, voxels_of_points
@@ -131,6 +134,7 @@ class Integration:
         # Room for images; sweeps of lidars are counted ray by ray, without a tally.
         reach_m = TIME_OF_FLIGHT_REACH_M if integrator.max_range_m is None else integrator.max_range_m
         self._tallies = TallyPool(geometry, max_range_m=reach_m, around_m=around_m)
+        self._votes = ClassVotes(geometry)
         self._lock = Lock()
         self.counts = ReturnCounts()
         """Count of the pixels of all scans, by what became of them."""
@@ -156,14 +160,16 @@ class Integration:
             max_range_m=limits.max_range_m,
             flying_step_m=limits.flying_step_m if window is not None else math.inf,
         )
-        # Stage 2: named readings, checked before anything is counted.
-        scalars = _scalar_evidence(scan, self._geometry)
+        # Stage 2: named readings and labels, checked before anything is counted.
+        scalars, classes = _scalar_evidence(scan, self._geometry), classes_of_labels(scan, self._geometry)
         # Stage 3: hits, samples and misses.
         if window is None:
             self._cast(scan, returns)
         elif returns.reach_m > 0:
             self._carve(scan, returns, window)
         self._tallies.merge(scalars)
+        # Stage 4: one vote for a class wherever a labelled pixel shows a voxel that was hit.
+        self._votes.add(classes, scan, rig, returns, ImageTransfers(scan, rig, returns, self._sample_limits))
         with self._lock:
             self.counts += returns.counts
 
@@ -223,7 +229,11 @@ class Integration:
 
     def diff(self, each: Each = map) -> dict[CellKey, Evidence]:
         """The evidence of all scans, by cell; `each` as for `Tally.packed`. Not while scans are being added."""
-        return self._tallies.packed(each)
+        counted, votes = self._tallies.packed(each), self._votes.diff()
+        if not votes:
+            return counted
+        parts = {key: [diff[key] for diff in (counted, votes) if key in diff] for key in sorted({*counted, *votes})}
+        return {key: both[0] if len(both) == 1 else sum_evidence(both, self._geometry) for key, both in parts.items()}
 
     def _add_sweep(self, scan: Scan, points: npt.NDArray[np.float32]) -> None:
         """Add a scan whose points have no raster, ray by ray."""
@@ -276,8 +286,7 @@ class Integration:
         self._tallies.merge(beam_evidence(origin_m, returns.points_map, clear_m, self._geometry, sums_of=sums_of))
 
     def _sample_sums(self, scan: Scan, returns: Returns, voxel_of: npt.NDArray[np.integer], count: int) -> Ints:
-        # A sample whose place is less certain than this could be another voxel's.
-        limit_m = self._integrator.sample_spread_voxels * self._geometry.voxel_edge_m
+        limits = self._sample_limits
         return sample_sums(
             scan,
             self._rig,
@@ -285,10 +294,16 @@ class Integration:
             returns,
             voxel_of,
             count,
-            spread_max_m=limit_m,
-            step_max_k=self._integrator.temperature_step_k,
-            hidden_behind_m=self._integrator.hidden_behind_m,
+            spread_max_m=limits.spread_max_m,
+            step_max_k=limits.step_max_k,
+            hidden_behind_m=limits.hidden_behind_m,
         )
+
+    @property
+    def _sample_limits(self) -> SampleLimits:
+        # A sample whose place is less certain than this could be another voxel's.
+        limit_m = self._integrator.sample_spread_voxels * self._geometry.voxel_edge_m
+        return SampleLimits(limit_m, self._integrator.temperature_step_k, self._integrator.hidden_behind_m)
 
     def _clear_ends(self, origin_m: Floats, points_map: Floats, sigma_m: Floats) -> Floats:
         edge_m, sigmas = self._geometry.voxel_edge_m, self._integrator.noise_sigmas

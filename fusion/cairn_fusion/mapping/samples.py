@@ -121,10 +121,10 @@ class ImageTransfers:
         for name, image in images.items():
             if taken.all():
                 return
-            transfer = self._transfer(name, taken)
+            transfer = self.into(name, taken)
             yield image, transfer.pixels, transfer.labels
 
-    def _transfer(self, name: str, taken: Flags) -> Transfer:
+    def into(self, name: str, taken: Flags) -> Transfer:
         """Transfer of all points into a camera's image; points with too uncertain a place there are so labelled."""
         src, limits = self._scan.range_camera, self._limits
         points = self._seen_points()

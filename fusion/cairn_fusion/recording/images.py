@@ -39,6 +39,8 @@ class ImageHeader:
     height: int
     grey16: bool
     """True for one channel of 16 bits: the only kind that can hold range, amplitude or counts."""
+    grey8: bool = False
+    """True for one channel of 8 bits, which label images may have, too."""
 
 
 def image_header(path: Path) -> ImageHeader:
@@ -102,6 +104,29 @@ def grey16_of_bytes(data: bytes, path: Path | str, size: Size | None = None) -> 
     return np.ascontiguousarray(counts, dtype=np.uint16)
 
 
+def read_labels(path: Path, size: Size | None = None) -> npt.NDArray[np.uint8 | np.uint16]:
+    """The (H, W) numbers in a grey PNG of 8 or 16 bits; arguments and errors as `read_colour`.
+
+    Raises:
+        BadInputError: also when the file holds colours or a palette, which is a picture *of* labels.
+    """
+    data = _read_regular(path)
+    header = _header(data, path)
+    if not header.grey8:
+        return grey16_of_bytes(data, path, size)
+    _check_size(header, size, path)
+    cv2 = opencv()
+    numbers = _decode(cv2, data, cv2.IMREAD_UNCHANGED, path)
+    if numbers.dtype != np.uint8 or numbers.ndim != 2:
+        raise DamagedDataError("bad_image", f"{path}: an 8-bit image decoded to {numbers.dtype} of {numbers.shape}")
+    return np.ascontiguousarray(numbers, dtype=np.uint8)
+
+
+def write_labels(path: Path, image: npt.NDArray[np.uint8 | np.uint16]) -> None:
+    """A grey PNG file of an (H, W) uint8 or uint16 image; mirror of `read_labels`."""
+    path.write_bytes(encode_png(np.ascontiguousarray(image), path))
+
+
 def write_colour(path: Path, image: Colour) -> None:
     """A PNG file of an (H, W, 3) uint8 R, G, B image; lossless mirror of `read_colour`."""
     if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
@@ -161,7 +186,9 @@ def _png_header(data: bytes) -> ImageHeader:
             raise ValueError("IHDR must be the first chunk, and come once")
         if header is None:
             width, height, bits, colour_type = struct.unpack_from(">IIBB", data, at + 8)
-            header = ImageHeader(width, height, grey16=bits == 16 and colour_type == 0)
+            header = ImageHeader(
+                width, height, grey16=bits == 16 and colour_type == 0, grey8=bits == 8 and colour_type == 0
+            )
         at += 12 + length
     if header is None:
         raise ValueError("no IHDR")

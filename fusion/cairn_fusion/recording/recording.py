@@ -20,7 +20,7 @@ import numpy as np
 from cairn_calib.rig.poses import Transform
 from cairn_calib.rig.rig import RIG_BYTES_MAX, Rig, rig_from_json
 from cairn_fusion.recording.frame_poses import FrameKey, FramePoses, PoseOptions, read_frame_poses
-from cairn_fusion.recording.images import read_colour, read_grey16
+from cairn_fusion.recording.images import read_colour, read_grey16, read_labels
 from cairn_fusion.recording.pose_rounding import PoseRounding
 from cairn_fusion.recording.recording_format import (
     BODY_FILE,
@@ -38,7 +38,7 @@ from cairn_fusion.recording.recording_format import (
     path_inside,
     read_header,
 )
-from cairn_fusion.recording.scan import Scan, check_scan
+from cairn_fusion.recording.scan import LabelNames, Scan, check_scan
 from cairn_fusion.recording.timed_lists import Line, TimedList, Value, lines, read_text, time_and_rest, timed_list
 from cairn_fusion.recording.trajectory import Trajectory, read_trajectory
 from cairn_map.errors import BadInputError, NotFoundError
@@ -100,6 +100,7 @@ class ScanFiles:
     amplitude_path: Path | None = None
     colour: Mapping[str, Path] = field(default_factory=dict)
     thermal: Mapping[str, Path] = field(default_factory=dict)
+    labels: Mapping[str, Path] = field(default_factory=dict)
     scalars: Mapping[str, float] = field(default_factory=dict)
     T_map_body: Transform | None = None
 
@@ -114,6 +115,8 @@ class Recording:
     stops: tuple[range, ...]
     range_encodings: Mapping[str, RangeEncoding]
     thermal_encodings: Mapping[str, ThermalEncoding] = field(default_factory=dict)
+    label_names: LabelNames = field(default_factory=dict)
+    """Class of each number of the label images; None: it says nothing."""
     note: str = ""
     rounding: PoseRounding = field(default_factory=PoseRounding)
     """Poses that were not quite rotations."""
@@ -159,6 +162,8 @@ class Recording:
                 name: decode_kelvin(read_grey16(path, self._size(name)), self.thermal_encodings[name])
                 for name, path in files.thermal.items()
             },
+            labels={name: read_labels(path, self._size(name)) for name, path in files.labels.items()},
+            label_names=self.label_names if files.labels else {},
             scalars=files.scalars,
             T_map_body=files.T_map_body,
         )
@@ -201,6 +206,7 @@ def open_recording(
         stops=_measurements(folder, files, scans_per_measurement),
         range_encodings=header.range,
         thermal_encodings=header.thermal,
+        label_names=_label_names(header),
         note=header.note,
         rounding=rounding,
         pose_notes=() if found is None else found.report(),
@@ -257,6 +263,7 @@ def _scan_files(
     amplitudes = {name: _image_list(folder, f"{name}.amplitude.txt") for name in header.amplitude}
     colours = {name: _image_list(folder, f"{name}.txt") for name in header.colour}
     thermals = {name: _image_list(folder, f"{name}.txt") for name in header.thermal}
+    labels = {name: _image_list(folder, f"{name}.labels.txt") for name in header.labels}
     scalars = _scalar_lists(folder)
     files = [
         ScanFiles(
@@ -267,6 +274,7 @@ def _scan_files(
             amplitude_path=_near(amplitudes, time_s, header.max_gap_s).get(camera),
             colour=_near(colours, time_s, header.max_gap_s),
             thermal=_near(thermals, time_s, header.max_gap_s),
+            labels=_near(labels, time_s, header.max_gap_s),
             scalars=_near(scalars, time_s, header.max_gap_s),
             T_map_body=None if body is None else body.pose_at(time_s, max_gap_s=header.max_pose_gap_s),
         )
@@ -275,6 +283,18 @@ def _scan_files(
     ]
     # Stable: of cameras that fired together, the header's order decides.
     return tuple(sorted(files, key=lambda entry: entry.time_s))
+
+
+def _label_names(header: RecordingHeader) -> dict[int, str | None]:
+    """The one table of all cameras' labels.
+
+    Raises:
+        BadInputError: two cameras' tables differ.
+    """
+    tables = list(header.labels.values())
+    if any(table != tables[0] for table in tables):
+        raise BadInputError("bad_recording", "the label images of all cameras of a recording share one table")
+    return {int(number): name for number, name in tables[0].items()} if tables else {}
 
 
 def _near(lists: Mapping[str, TimedList[Value]], time_s: float, max_gap_s: float) -> dict[str, Value]:

@@ -8,6 +8,7 @@ time-of-flight camera the distance along the beam. A mix-up bends every wall by 
 callers choose a function by convention: `range_from_z_depth` or `range_from_radial`.
 """
 
+import json
 import re
 from enum import StrEnum
 from pathlib import Path, PurePosixPath
@@ -23,6 +24,7 @@ from cairn_calib.rig.rig import Rig, Spectrum
 from cairn_fusion.recording.timed_lists import read_text
 from cairn_map.arrays import Counts
 from cairn_map.errors import BadInputError, first_error
+from cairn_map.evidence.channels import ClassName
 
 Image = npt.NDArray[np.generic]
 Ranges = npt.NDArray[np.float32]
@@ -49,6 +51,10 @@ Kelvin = npt.NDArray[np.float32]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Seconds = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+
+LabelNumber = Annotated[str, Field(pattern=r"^(0|[1-9][0-9]{0,4})$")]
+LabelTable = Annotated[dict[LabelNumber, ClassName | None], Field(min_length=1, max_length=COUNT_MAX + 1)]
 
 
 class Convention(StrEnum):
@@ -93,6 +99,9 @@ class RecordingHeader(BaseModel):
     amplitude: tuple[str, ...] = ()
     colour: tuple[str, ...] = ()
     thermal: dict[str, ThermalEncoding] = Field(default_factory=dict)
+    labels: Annotated[dict[str, LabelTable], Field(exclude_if=lambda tables: not tables)] = {}
+    """Class of each number in each camera's label images; null: such a pixel says nothing. Written only where there are
+    labels, for older readers refuse the field."""
     max_gap_s: Seconds = 0.0
     """Largest time between the range image and another camera's image, seconds; 0: the same time stamp."""
     max_pose_gap_s: Seconds = 0.0
@@ -110,9 +119,26 @@ def header_from_json(text: str) -> RecordingHeader:
         BadInputError: not JSON, another format or version, or a field is missing or out of range.
     """
     try:
+        if twice := keys_twice(text):
+            raise BadInputError("bad_recording", f"{HEADER_FILE}: {twice[:64]!r} stands twice in one table")
         return RecordingHeader.model_validate_json(text)
     except ValidationError as exc:
         raise BadInputError("bad_recording", f"{HEADER_FILE}: {first_error(exc)}") from exc
+
+
+def keys_twice(text: str) -> str:
+    """A key that stands twice in one object of a JSON text, of which readers would take either; empty if none does."""
+    twice: list[str] = []
+
+    def seen(pairs: list[tuple[str, object]]) -> None:
+        keys = [key for key, _ in pairs]
+        twice.extend(key for key in {*keys} if keys.count(key) > 1)
+
+    try:
+        json.loads(text, object_pairs_hook=seen)
+    except (ValueError, RecursionError):
+        return ""  # no JSON: the header's own check says so
+    return min(twice, default="")
 
 
 def read_header(folder: Path) -> RecordingHeader:
@@ -151,6 +177,11 @@ def check_cameras(header: RecordingHeader, rig: Rig) -> None:
                 "bad_recording",
                 f"{HEADER_FILE}: {name} looks all around, so its distances must be along the beam, not z",
             )
+    for name, table in header.labels.items():
+        check_camera_name(name)
+        _ = rig[name]  # any spectrum: labels are of what a camera's raster shows
+        if max(map(int, table)) > COUNT_MAX:
+            raise BadInputError("bad_recording", f"{HEADER_FILE}: labels of {name} are numbers up to {COUNT_MAX}")
     if stray := set(header.amplitude) - set(header.range):
         raise BadInputError("bad_recording", f"{HEADER_FILE}: amplitude without range for {', '.join(sorted(stray))}")
 

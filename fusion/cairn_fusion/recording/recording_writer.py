@@ -16,7 +16,7 @@ import numpy as np
 
 from cairn_calib.rig.image_files import write_grey16
 from cairn_calib.rig.rig import Rig
-from cairn_fusion.recording.images import write_colour
+from cairn_fusion.recording.images import write_colour, write_labels
 from cairn_fusion.recording.recording_format import (
     BODY_FILE,
     CHANNEL,
@@ -96,6 +96,7 @@ class RecordingWriter:
             raise BadInputError("bad_output", f"cannot record into {self.folder}: {exc.strerror}") from exc
         self._stack = ExitStack()
         self._lists: dict[str, TextIO] = {}
+        self._label_table: dict[int, str | None] = {}
         self._recorded: dict[tuple[str, str], None] = {}
         """(list in the header, camera), in order of first use."""
         self._scan_count = 0
@@ -135,6 +136,8 @@ class RecordingWriter:
                 )
         if self._scan_count and (scan.T_map_body is not None) != (BODY_FILE in self._lists):
             raise BadInputError("bad_scan", "either every scan of a recording says where the body was, or none does")
+        if scan.labels and self._label_table not in ({}, dict(scan.label_names)):
+            raise BadInputError("bad_scan", "the label images of all scans of a recording share one table")
         # Images first, then their lines: a list never names a file that is missing.
         time_s = float(scan.time_s)
         for list_name, relative in self._write_images(scan).items():
@@ -172,6 +175,7 @@ class RecordingWriter:
             for file in self._lists.values():
                 file.flush()
                 os.fsync(file.fileno())
+        label_table = {str(number): name for number, name in self._label_table.items()}
         # The header comes last, and in one step: it is what makes a folder a recording.
         header = self._header.model_copy(
             update={
@@ -179,6 +183,7 @@ class RecordingWriter:
                 "amplitude": tuple(self._cameras("amplitude")),
                 "colour": tuple(self._cameras("colour")),
                 "thermal": dict.fromkeys(self._cameras("thermal"), self._thermal_encoding),
+                "labels": dict.fromkeys(self._cameras("labels"), label_table),
             }
         )
         partial = self.folder / f"{HEADER_FILE}.partial"
@@ -198,18 +203,23 @@ class RecordingWriter:
         counts |= {thermal: encode_kelvin(kelvin, self._thermal_encoding) for thermal, kelvin in scan.thermal.items()}
         if scan.amplitude is not None:
             counts[f"{scan.range_camera}.amplitude"] = scan.amplitude
-        for folder in [*counts, *scan.colour]:
+        for folder in [*counts, *scan.colour, *(f"{labelled}.labels" for labelled in scan.labels)]:
             (self.folder / "images" / folder).mkdir(parents=True, exist_ok=True)
         for folder, image in counts.items():
             write_grey16(self.folder / "images" / folder / name, image)
         for folder, colour in scan.colour.items():
             write_colour(self.folder / "images" / folder / name, colour)
+        labels = {f"{camera_name}.labels": numbers for camera_name, numbers in scan.labels.items()}
+        for folder, numbers in labels.items():
+            write_labels(self.folder / "images" / folder / name, numbers)
+        self._label_table = dict(scan.label_names) if scan.labels else self._label_table
+        self._recorded |= dict.fromkeys(("labels", labelled) for labelled in scan.labels)
         self._recorded["range", scan.range_camera] = None
         if scan.amplitude is not None:
             self._recorded["amplitude", scan.range_camera] = None
         self._recorded |= dict.fromkeys(("colour", folder) for folder in scan.colour)
         self._recorded |= dict.fromkeys(("thermal", folder) for folder in scan.thermal)
-        return {f"{folder}.txt": f"images/{folder}/{name}" for folder in [*counts, *scan.colour]}
+        return {f"{folder}.txt": f"images/{folder}/{name}" for folder in [*counts, *scan.colour, *labels]}
 
     def _cameras(self, kind: str) -> list[str]:
         return [camera for recorded, camera in self._recorded if recorded == kind]

@@ -4,6 +4,7 @@
     amplitude    (H, W) uint16    what the time-of-flight camera's own light returned
     colour       {camera: (H, W, 3) uint8}     sRGB, in R, G, B order
     thermal      {camera: (H, W) float32}      apparent temperature, kelvin; NaN = no reading
+    labels       {camera: (H, W) uint8, uint16}   number of what each pixel shows, in the words of `label_names`
     scalars      {channel: float}              named readings at the rig's origin (dose, gas, ...)
     points_m     (N, 3) float32   metres, of a sweep without a raster; then range_m is its image to look at
     T_map_body   pose of the robot's body, so that its own points can be left out
@@ -23,6 +24,9 @@ from cairn_fusion.recording.scan_units import check_ranges, check_temperatures, 
 from cairn_map.errors import BadInputError
 
 Image = npt.NDArray[np.generic]
+LabelNames = Mapping[int, str | None]
+LABEL_MAX = 65535
+"""Largest number of a label."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,6 +45,10 @@ class Scan:
     amplitude: npt.NDArray[np.uint16] | None = None
     colour: Mapping[str, npt.NDArray[np.uint8]] = field(default_factory=dict)
     thermal: Mapping[str, npt.NDArray[np.float32]] = field(default_factory=dict)
+    labels: Mapping[str, npt.NDArray[np.uint8 | np.uint16]] = field(default_factory=dict)
+    """Label images of the rig's cameras, of any spectrum, in the raster of their camera."""
+    label_names: LabelNames = field(default_factory=dict)
+    """Class of each number that a label image holds; None: such a pixel says nothing."""
     scalars: Mapping[str, float] = field(default_factory=dict)
     T_map_body: Transform | None = None
     """Pose of the frame of the rig's body; None: the body's boxes are in the rig's frame."""
@@ -87,6 +95,7 @@ def check_scan(scan: Scan, rig: Rig) -> None:
     for name, kelvin in scan.thermal.items():
         _check_image(rig, name, kelvin, Spectrum.THERMAL, np.float32)
         check_temperatures(name, kelvin)
+    _check_labels(scan, rig)
     check_ranges(scan.range_camera, scan.range_m)
     check_time(scan.time_s)
 
@@ -100,8 +109,27 @@ def _check_image(rig: Rig, name: str, image: Image, spectrum: Spectrum, dtype: t
     mounted.camera.check_image(image, name=f"{spectrum} image of {name}")
 
 
+def _check_labels(scan: Scan, rig: Rig) -> None:
+    """Refuse label images that are not their camera's in size or type, or hold numbers that the table lacks."""
+    if any(not 0 <= number <= LABEL_MAX for number in scan.label_names):
+        raise BadInputError("bad_labels", f"a table of labels has numbers from 0 to {LABEL_MAX}")
+    for name, image in scan.labels.items():
+        if image.dtype not in (np.uint8, np.uint16) or image.ndim != 2:
+            raise BadInputError(
+                "bad_scan", f"labels of {name} must be (H, W) uint8 or uint16, got {image.dtype} of shape {image.shape}"
+            )
+        rig[name].camera.check_image(image, name=f"label image of {name}")
+        found = np.flatnonzero(np.bincount(image.ravel(), minlength=1))
+        strange = [number for number in found.tolist() if number not in scan.label_names]
+        if strange:
+            numbers = ", ".join(map(str, strange[:8]))
+            raise BadInputError(
+                "unknown_label", f"labels of {name} hold {numbers}, which the table does not name (null: says nothing)"
+            )
+
+
 def _check_points(scan: Scan, points: Image) -> None:
     if points.ndim != 2 or points.shape[1] != 3 or points.dtype != np.float32:
         raise BadInputError("bad_scan", f"points_m must be (N, 3) float32, got {points.dtype} of shape {points.shape}")
-    if scan.amplitude is not None or scan.colour or scan.thermal:
-        raise BadInputError("bad_scan", "points without a raster carry no amplitude, colour or temperature")
+    if scan.amplitude is not None or scan.colour or scan.thermal or scan.labels:
+        raise BadInputError("bad_scan", "points without a raster carry no amplitude, colour, temperature or labels")

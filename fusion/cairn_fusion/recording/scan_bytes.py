@@ -37,6 +37,8 @@ def encode_scan(scan: Scan) -> bytes:
         "scalars": {name: float(value) for name, value in scan.scalars.items()},
         "arrays": [(*name, array.dtype.str, array.shape) for name, array in arrays.items()],
     }
+    if scan.label_names:
+        head["label_names"] = [(int(number), name) for number, name in scan.label_names.items()]
     text = json.dumps(head).encode()
     raw = b"".join(array.tobytes() for array in arrays.values())
     packed = zstandard.ZstdCompressor(level=LEVEL, write_checksum=True).compress(raw)
@@ -68,6 +70,8 @@ def decode_scan(data: bytes) -> Scan:
             amplitude=arrays.get(("amplitude", "")),
             colour=_of_kind(arrays, "colour"),
             thermal=_of_kind(arrays, "thermal"),
+            labels=_of_kind(arrays, "labels"),
+            label_names={int(number): name for number, name in head.get("label_names", ())},
             scalars=head["scalars"],
             T_map_body=arrays.get(("pose", "body")),
         )
@@ -140,6 +144,7 @@ def _arrays(scan: Scan) -> dict[tuple[str, str], Array]:
         arrays["amplitude", ""] = scan.amplitude
     arrays |= {("colour", name): image for name, image in scan.colour.items()}
     arrays |= {("thermal", name): image for name, image in scan.thermal.items()}
+    arrays |= {("labels", name): image for name, image in scan.labels.items()}
     return arrays
 
 

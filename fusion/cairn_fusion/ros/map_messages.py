@@ -26,6 +26,7 @@ from cairn_map.commits.mark import Mark
 from cairn_map.errors import DamagedDataError
 from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.voxels import Voxels
+from cairn_map.files.cell_files import colours
 from cairn_map.queries.floor_grid import FloorGrid
 
 GRID = "nav_msgs/msg/OccupancyGrid"
@@ -300,11 +301,11 @@ def _pose(t: Sequence[float], q: Sequence[float]) -> Any:
 
 def _packed_colours(voxels: Voxels) -> npt.NDArray[np.float32]:
     """(N,) 0x00RRGGBB, as the bits of a float, which is how PCL has colours."""
-    colour = voxels.of_kind(ChannelKind.COLOUR)
+    shown = voxels.of_kind(ChannelKind.COLOUR) or voxels.of_kind(ChannelKind.CLASSES)
     packed = np.full(len(voxels), UNCOLOURED, np.uint32)
-    if colour is not None:
-        seen = colour.weight > 0
-        red, green, blue = np.clip(np.rint(colour.mean[seen]), 0, 255).astype(np.uint32).T
+    if shown is not None:
+        seen = shown.weight > 0
+        red, green, blue = colours(voxels)[seen].astype(np.uint32).T
         packed[seen] = (red << 16) | (green << 8) | blue
     return packed.view(np.float32)
 

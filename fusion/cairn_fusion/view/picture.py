@@ -90,9 +90,12 @@ def _in_frame(voxels: Voxels, ceiling_m: float | None) -> npt.NDArray[np.bool_]:
 def _panels(voxels: Voxels, keep: npt.NDArray[np.bool_]) -> list[Panel]:
     """Views of what was measured; scales are those of the voxels that are drawn."""
     colour, thermal = voxels.of_kind(ChannelKind.COLOUR), voxels.of_kind(ChannelKind.TEMPERATURE)
+    named = voxels.of_kind(ChannelKind.CLASSES)
     panels = list[Panel]()
     if colour is not None and (colour.weight[keep] > 0).any():
         panels.append(Panel("colour", colours(voxels)))
+    elif colour is None and named is not None and (named.weight[keep] > 0).any():
+        panels.append(Panel("class", colours(voxels)))
     else:
         heights = voxels.centres_m[:, 2]
         panels.append(_scalar_panel("height (no colour measured)", heights, keep, cv2.COLORMAP_VIRIDIS, "{:.2f} m"))

@@ -37,6 +37,7 @@ from cairn_map.codec.octree.cell_head import CellHead, encode_head
 from cairn_map.codec.octree.channel_streams import ChannelRows, stream_of_channel
 from cairn_map.codec.octree.streams import MODELLED, StoredStream, join_streams, stored_streams
 from cairn_map.errors import DamagedDataError
+from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.compact_cell import CellCoding
 from cairn_map.evidence.evidence import Evidence, check_fits, empty_evidence
 from cairn_map.evidence.grid import CellKey, Geometry, cell_of_key
@@ -251,7 +252,9 @@ def _modelled(content: CellContent, parts: list[ChannelRows], geometry: Geometry
     # A channel is modelled on the weights of the channel before it.
     hits, before = content.counts[:, 0].copy(), np.zeros(leaves, np.int64)
     for c, (channel, rows) in enumerate(zip(geometry.channels, parts, strict=True)):
-        groups[stream_of_channel(c)] = small_profile.encode_channel(channel, rows, hits, before, ground)
+        # Votes for classes have no model: they are few numbers, and small ones.
+        if channel.kind is not ChannelKind.CLASSES:
+            groups[stream_of_channel(c)] = small_profile.encode_channel(channel, rows, hits, before, ground)
         before = small_profile.weights_by_leaf(rows, leaves)
     return groups
 

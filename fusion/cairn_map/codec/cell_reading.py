@@ -34,7 +34,7 @@ from cairn_map.codec.octree.cell_content import (
     topology_streams,
 )
 from cairn_map.codec.octree.cell_head import CellHead, decode_head, is_canonical_head
-from cairn_map.codec.octree.channel_streams import ChannelRows, stream_of_channel
+from cairn_map.codec.octree.channel_streams import ChannelRows, stream_count, stream_of_channel
 from cairn_map.codec.octree.octree import Octree, parse_octree
 from cairn_map.codec.octree.streams import (
     MODELLED,
@@ -47,6 +47,7 @@ from cairn_map.codec.octree.streams import (
 )
 from cairn_map.codec.plain_cell import PlainCell, is_plain, plain_content
 from cairn_map.errors import BadInputError, DamagedDataError
+from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.grid import BRICK_DEPTH
 
 VOXEL_BYTES = 12
@@ -301,7 +302,7 @@ class _Parts:
     def channel(self, c: int, sampled_max: int) -> ChannelRows:
         """Samples of all leaves."""
         if c not in self._channels:
-            is_modelled = self._is_modelled(self._numbers_of(c))
+            is_modelled = self._is_channel_modelled(c)
             self._channels[c] = (
                 self._modelled_channel(c, sampled_max) if is_modelled else self._raw_channel(c, sampled_max, None)
             )
@@ -309,7 +310,7 @@ class _Parts:
 
     def channel_before(self, c: int, stop: int, sampled_max: int) -> ChannelRows:
         """Samples of the leaves before `stop` at least: of all, if the channel is decoded already or modelled."""
-        if c in self._channels or self._is_modelled(self._numbers_of(c)):
+        if c in self._channels or self._is_channel_modelled(c):
             return self.channel(c, sampled_max)
         return self._raw_channel(c, sampled_max, stop)
 
@@ -348,17 +349,21 @@ class _Parts:
         self._encode_again(channel_streams.encode_channel(first, channel, rows, leaves=head.leaves, signed=head.signed))
         return rows
 
+    def _is_channel_modelled(self, c: int) -> bool:
+        has_votes = self._head.geometry.channels[c].kind is ChannelKind.CLASSES
+        return self._is_modelled(self._numbers_of(c), has_votes=has_votes)
+
     def _numbers_of(self, c: int) -> list[int]:
         """Numbers of a channel's streams: presence, weight and values."""
         first = stream_of_channel(c)
-        return list(range(first, first + 1 + len(self._head.geometry.channels[c].planes)))
+        return list(range(first, first + stream_count(self._head.geometry.channels[c])))
 
     def _stream(self, number: int) -> StoredStream:
         if number not in self._stored:
             raise DamagedDataError("bad_stream", f"stream {number} is missing")
         return self._stored[number]
 
-    def _is_modelled(self, numbers: list[int]) -> bool:
+    def _is_modelled(self, numbers: list[int], *, has_votes: bool = False) -> bool:
         """True if a group is modelled: all of its streams or none, and only the first has bytes."""
         group = [self._stream(number) for number in numbers]
         modelled = [stream for stream in group if stream.coding == MODELLED]
@@ -366,6 +371,8 @@ class _Parts:
             return False
         if len(modelled) < len(group) or any(stream.body for stream in group[1:]) or self._head.signed:
             raise DamagedDataError("bad_stream", f"streams {numbers} are modelled in part, or in a signed cell")
+        if has_votes:
+            raise DamagedDataError("bad_stream", f"streams {numbers} are votes for classes, which have no model")
         return True
 
     def _encode_again(self, streams: dict[int, bytes]) -> None:

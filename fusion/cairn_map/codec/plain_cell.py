@@ -53,9 +53,11 @@ class PlainCell:
 def is_plain(head: CellHead, stored: Mapping[int, StoredStream]) -> bool:
     """True if a cell can be read in one pass."""
     streams = stored.values()
+    kinds = tuple(channel.kind for channel in head.geometry.channels)
     return (
         not head.signed
-        and tuple(stored) == _numbers(tuple(channel.kind for channel in head.geometry.channels))
+        and ChannelKind.CLASSES not in kinds
+        and tuple(stored) == _numbers(kinds)
         and all(stream.coding != MODELLED for stream in streams)
         and sum(stream.raw_bytes for stream in streams) <= PLAIN_BYTES_MAX
     )

@@ -1,7 +1,7 @@
 """Kernels of plain cells: a whole unsigned cell from its raw streams, in two passes: sizes and checks, then numbers.
 
     data   all raw streams, one after the other       at, size   first byte of each, and its length
-    spec   (channels, 2) planes of each channel, and how many are sums of squares (`channels.planes_and_squares`)
+    spec   (channels, 3) planes of each channel, and how many are sums of squares (`channels.planes_and_squares`)
 
 Streams are in the order of FORMAT.md section 6: child masks, leaf masks, hits, misses, and of each channel presence,
 weight, values. One pass over all columns takes a fraction of a pass for each: most cells of a diff have some hundred

@@ -294,7 +294,7 @@ def check_samples(samples: npt.NDArray[np.int64], geometry: Geometry) -> None:
         BadInputError: kind `bad_evidence`.
     """
     if not every_sum_has_weight(samples, geometry):
-        raise BadInputError("bad_evidence", "a channel has sums without weight")
+        raise BadInputError("bad_evidence", "a channel has sums without weight, or more votes than its weight")
 
 
 def evidence_limit_bytes(size_bytes: int) -> int:

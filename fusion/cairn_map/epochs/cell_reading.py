@@ -315,7 +315,7 @@ def _joinable(
     rows: Sequence[Evidence], voxels: Words32, counts: ReadCounts, geometry: Geometry
 ) -> tuple[_Samples, ...]:
     """Samples of rows, the oldest first, that rule R4 may join to those of a newer one; the newest row's come first."""
-    planes, _ = planes_and_squares(geometry.channels).T
+    planes = planes_and_squares(geometry.channels)[:, 0]
     weights = np.cumsum(planes) - 1
     at_rows = [row.voxels[row.sampled] for row in rows]
     sampled = np.unique(np.concatenate([np.empty(0, np.uint32), *at_rows]))

@@ -30,6 +30,7 @@ SAMPLE_SIGMA = {
     ChannelKind.INTENSITY: 0.0,
     ChannelKind.TEMPERATURE: 0.5,
     ChannelKind.SCALAR: 0.0,
+    ChannelKind.CLASSES: 0.0,
 }
 """Standard deviation of one sample, in the channel's unit: sRGB steps of a textured surface, kelvin of an uncooled
 camera. 0: unknown, so that only equal means are joined."""

@@ -83,7 +83,7 @@ def join_samples_into(
         row_voxels: (S,) voxels of the row that have samples.
         row_samples: (S, P) their sums.
         row: number of the row.
-        spec: (C, 2) planes of each channel, and how many of them are squares.
+        spec: (C, 3) planes of each channel, how many of them are squares, and whether they are votes for classes.
         sigma: (C,) standard deviation of one sample, in steps of the channel.
         free_after: (V,) number of the newest row after which the voxel read free; older samples are not shown.
         samples: (V, P) sums shown, changed.
@@ -104,18 +104,20 @@ def join_samples_into(
             w, held = row_samples[n, weight], samples[at, weight]
             if w != 0 and not done[at, c]:
                 # R4: the newest row is shown in any case, an older one if all means agree within the error of both.
+                # Votes for classes are joined up to as many, whether they agree or not: they are counts, not means.
                 agrees = True
-                if held != 0:
+                if held != 0 and spec[c, 2] == 0:
                     bound = AGREE_SIGMA * sigma[c] * np.sqrt(1.0 / w + 1.0 / held)
                     for p in range(first, weight - spec[c, 1]):
                         agrees &= abs(row_samples[n, p] / w - samples[at, p] / held) <= bound
-                else:
+                if held == 0:
                     newest[at, c] = row
                 # Enough is enough: older samples can only be of another state.
                 if agrees:
                     for p in range(first, weight + 1):
                         samples[at, p] += row_samples[n, p]
-                done[at, c] = not agrees or samples[at, weight] >= (JOINED_MIN if held != 0 else ALONE_MIN)
+                enough = JOINED_MIN if held != 0 or spec[c, 2] != 0 else ALONE_MIN
+                done[at, c] = not agrees or samples[at, weight] >= enough
             first = weight + 1
 
 

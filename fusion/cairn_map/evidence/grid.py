@@ -21,7 +21,7 @@ from pydantic import BaseModel, FailFast, Field, model_validator
 
 from cairn_map.arrays import Ints
 from cairn_map.errors import BadInputError
-from cairn_map.evidence.channels import STANDARD_CHANNELS, Channel
+from cairn_map.evidence.channels import STANDARD_CHANNELS, Channel, ChannelKind
 from cairn_map.kernels.morton_kernels import UInts, deinterleave, interleave
 
 CellKey = NewType("CellKey", int)
@@ -67,6 +67,13 @@ class Geometry(BaseModel, frozen=True, extra="forbid"):
     def _with_depth(self) -> Self:
         if "depth" not in self.model_fields_set:
             object.__setattr__(self, "depth", _standard_depth(self.voxel_edge_um, self.plane_count))
+        return self
+
+    @model_validator(mode="after")
+    def _one_list_of_classes(self) -> Self:
+        # The number of a plane is a byte of the fingerprint's weights: one list of 64 fits, two might not.
+        if sum(channel.kind is ChannelKind.CLASSES for channel in self.channels) > 1:
+            raise ValueError("a map has one channel of classes at most; more classes are another layer")
         return self
 
     @model_validator(mode="after")

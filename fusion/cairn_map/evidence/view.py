@@ -16,10 +16,11 @@ import numpy.typing as npt
 
 from cairn_map.arrays import Floats, Ints
 from cairn_map.errors import BadInputError
-from cairn_map.evidence.channels import Channel, ChannelKind
+from cairn_map.evidence.channels import Channel, ChannelKind, class_colours
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.inverse_sensor_model import LOG_ODDS_STEP, SensorModel, log_odds
+from cairn_map.evidence.voxels import reading_of_sums
 
 LOG_ODDS_ZERO = 1 << 15
 """Added to log-odds in steps, so that they are 16 bits without a sign."""
@@ -140,9 +141,12 @@ def view_of(evidence: Evidence, geometry: Geometry, model: SensorModel, style: V
     rows = _rows_of(evidence.voxels[evidence.sampled] >> np.uint32(3 * (geometry.depth - depth)), nodes)
     colour = next((c for c in geometry.channels if c.kind is ChannelKind.COLOUR), None)
     thermal = next((c for c in geometry.channels if c.kind is ChannelKind.TEMPERATURE), None)
+    named = next((c for c in geometry.channels if c.kind is ChannelKind.CLASSES), None)
     coloured, rgb = np.empty(0, np.int64), np.empty((0, len(TOPS[style.colours])), np.int64)
     if colour is not None and style.colours is not Colours.NONE:
         coloured, rgb = _colours(evidence.samples[:, geometry.planes_of(colour.name)], colour, rows, style)
+    elif named is not None and style.colours is not Colours.NONE:
+        coloured, rgb = _class_colours(evidence.samples[:, geometry.planes_of(named.name)], named, rows, style)
     columns = 0 if style.temperature_step_k is None else 1 if depth == geometry.depth else 2
     warm, temperatures = np.empty(0, np.int64), np.empty((0, columns), np.int64)
     if thermal is not None and style.temperature_step_k is not None:
@@ -176,6 +180,16 @@ def _colours(sums: Ints, channel: Channel, rows_of_samples: Ints, style: ViewSty
     totals = np.add.reduceat(mine, starts, axis=0)
     mean = totals[:, :3] / totals[:, 3:] * channel.step + channel.zero
     return rows, np.rint(np.clip(mean, 0, 255) * np.array(TOPS[style.colours]) / 255).astype(np.int64)
+
+
+def _class_colours(sums: Ints, channel: Channel, rows_of_samples: Ints, style: ViewStyle) -> tuple[Ints, Ints]:
+    """Colours of the classes of a map without a colour camera: of all votes below a node the class with the most."""
+    rows, starts, mine = _by_node(sums, rows_of_samples)
+    if not len(rows):
+        return rows, np.empty((0, 3), np.int64)
+    numbers = reading_of_sums(channel, np.add.reduceat(mine, starts, axis=0)).mean.astype(np.int64)
+    rgb = class_colours(len(channel.classes))[numbers].astype(np.float64)
+    return rows, np.rint(rgb * np.array(TOPS[style.colours]) / 255).astype(np.int64)
 
 
 def _temperatures(sums: Ints, channel: Channel, rows_of_samples: Ints) -> tuple[Ints, Floats]:

@@ -19,10 +19,16 @@ THERMAL_SIGMA_K = 1.0
 """Standard uncertainty of a thermal camera itself, kelvin, which no number of scans lowers: makers of uncooled
 radiometric cameras state 2 K at best, two standard deviations, and a map does not know its cameras."""
 
+CLEAR_LEAD = 2
+"""Votes by which a class leads the next, at least, to be sure."""
+
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """A channel's mean in its unit (N,) or (N, 3), and the weight (N,) behind it; NaN where the weight is 0."""
+    """A channel's mean in its unit (N,) or (N, 3), and the weight (N,) behind it; NaN where the weight is 0.
+
+    Of a channel of classes the mean is the number of the class with the most votes, of equal ones the smaller number.
+    """
 
     channel: Channel
     mean: Floats
@@ -32,6 +38,18 @@ class Reading:
     measured_s: Floats | None = None
     """(N,) first instant of the epoch of the newest samples, UTC seconds since 1970, NaN where unknown; None: not asked
     for, or of a map without epochs."""
+    unsure: npt.NDArray[np.bool_] | None = None
+    """(N,) True where the class leads the next by less than two votes; of classes only."""
+
+    @property
+    def class_names(self) -> list[str | None]:
+        """(N,) names of the classes; None where there are no votes, and of a channel of another kind."""
+        return [self.name_at(row) for row in range(len(self.weight))]
+
+    def name_at(self, row: int) -> str | None:
+        """Name of the class of one voxel; None without votes, and of a channel of another kind."""
+        names = self.channel.classes
+        return names[int(self.mean[row])] if names and self.weight[row] > 0 else None
 
     @property
     def sigma(self) -> Floats | None:
@@ -41,7 +59,8 @@ class Reading:
     def rows(self, rows: npt.NDArray[np.int64]) -> "Reading":
         """Reading of the voxels in these rows alone, in this order."""
         spread, measured_s = (None if array is None else array[rows] for array in (self.spread, self.measured_s))
-        return Reading(self.channel, self.mean[rows], self.weight[rows], spread, measured_s)
+        unsure = None if self.unsure is None else self.unsure[rows]
+        return Reading(self.channel, self.mean[rows], self.weight[rows], spread, measured_s, unsure)
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,12 +110,7 @@ def voxels_of_evidence(
 
 def joined_voxels(parts: list[Voxels]) -> Voxels:
     """Voxels of several cells as one table; at least one part, all of one map."""
-    readings: dict[str, Reading] = {}
-    for name, first in parts[0].readings.items():
-        mine = [part.readings[name] for part in parts]
-        spread, measured_s = (_joined(arrays) for arrays in zip(*((r.spread, r.measured_s) for r in mine), strict=True))
-        mean, weight = np.concatenate([r.mean for r in mine]), np.concatenate([r.weight for r in mine])
-        readings[name] = Reading(first.channel, mean, weight, spread, measured_s)
+    readings = {name: joined_readings([part.readings[name] for part in parts]) for name in parts[0].readings}
     return Voxels(
         np.concatenate([part.numbers for part in parts]),
         np.concatenate([part.centres_m for part in parts]),
@@ -104,6 +118,15 @@ def joined_voxels(parts: list[Voxels]) -> Voxels:
         np.concatenate([part.probability for part in parts]),
         readings,
     )
+
+
+def joined_readings(parts: Sequence[Reading]) -> Reading:
+    """Readings of one channel as one; at least one part."""
+    spread, measured_s = (_joined(arrays) for arrays in zip(*((r.spread, r.measured_s) for r in parts), strict=True))
+    mean, weight = np.concatenate([r.mean for r in parts]), np.concatenate([r.weight for r in parts])
+    doubts = [r.unsure for r in parts if r.unsure is not None]
+    unsure = np.concatenate(doubts) if doubts else None
+    return Reading(parts[0].channel, mean, weight, spread, measured_s, unsure)
 
 
 def measured_or_none(reading: Reading, row: int) -> float | None:
@@ -119,6 +142,8 @@ def _joined(arrays: Sequence[Floats | None]) -> Floats | None:
 
 def reading_of_sums(channel: Channel, sums: npt.NDArray[np.int64]) -> Reading:
     """Reading of (N, planes) sums of one channel."""
+    if channel.kind is ChannelKind.CLASSES:
+        return _class_reading(channel, sums)
     # mean = sum / weight; spread^2 = sum of squares / weight - mean^2.
     weight = sums[:, -1]
     divisor = np.where(weight > 0, weight, np.nan)
@@ -129,3 +154,15 @@ def reading_of_sums(channel: Channel, sums: npt.NDArray[np.int64]) -> Reading:
         variance = np.maximum(sums[:, 1] / divisor - values[:, 0] ** 2, 0)
         spread = np.sqrt(variance) * channel.step
     return Reading(channel, mean if channel.value_count > 1 else mean[:, 0], weight, spread)
+
+
+def _class_reading(channel: Channel, sums: npt.NDArray[np.int64]) -> Reading:
+    """Class with the most votes, of equal ones that of the smaller number; unsure if it leads by less than two."""
+    weight = sums[:, -1]
+    # The last class is what the votes for the others leave; clamped when read, never when merged.
+    votes = np.concatenate([sums[:, :-1], np.maximum(weight - sums[:, :-1].sum(axis=1), 0)[:, None]], axis=1)
+    best = votes.argmax(axis=1)
+    second, first = np.partition(votes, -2, axis=1)[:, -2:].T
+    has_votes = weight > 0
+    number = np.where(has_votes, best, np.nan)
+    return Reading(channel, number, weight, unsure=has_votes & (first - second < CLEAR_LEAD))

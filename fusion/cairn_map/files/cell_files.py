@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from cairn_map.codec.view_code import encode_view
 from cairn_map.errors import BadInputError
-from cairn_map.evidence.channels import ChannelKind
+from cairn_map.evidence.channels import ChannelKind, class_colours
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey, Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
@@ -51,7 +51,9 @@ def ply_file(voxels: Voxels) -> bytes:
 
     Properties: x y z (float, metres, map frame), red green blue (uchar), probability (float), temperature (float,
     kelvin, NaN where no thermal camera looked), intensity (float), hits, misses (int); of a dated reading colour,
-    temperature and intensity `_measured_s` (double, UTC seconds since 1970, NaN where unknown).
+    temperature and intensity `_measured_s` (double, UTC seconds since 1970, NaN where unknown). Of a channel of classes
+    `class` (short, its number, -1 without votes) and `unsure` (uchar, 1 where it leads by less than two votes); a
+    comment for each class gives its number and its name.
     """
     N = len(voxels)
     fields: list[tuple[str, str]] = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
@@ -60,6 +62,8 @@ def ply_file(voxels: Voxels) -> bytes:
     named = {name: voxels.of_kind(kind) for name, kind in NAMED.items()}
     times = {f"{name}_measured_s": r.measured_s for name, r in named.items() if r and r.measured_s is not None}
     fields += [(name, "<f8") for name in times]
+    classes = voxels.of_kind(ChannelKind.CLASSES)
+    fields += [("class", "<i2"), ("unsure", "u1")] if classes else []
     table = np.zeros(N, np.dtype(fields))
     for axis, name in enumerate("xyz"):
         table[name] = voxels.centres_m[:, axis]
@@ -73,15 +77,20 @@ def ply_file(voxels: Voxels) -> bytes:
     table["hits"], table["misses"] = voxels.counts.T
     for name, measured_s in times.items():
         table[name] = measured_s
-    words = {"<f4": "float", "<f8": "double", "u1": "uchar", "<i4": "int"}
-    head = ["ply", "format binary_little_endian 1.0", "comment cairn; metres, map frame; kelvin", f"element vertex {N}"]
+    if classes is not None and classes.unsure is not None:
+        table["class"] = np.nan_to_num(classes.mean, nan=-1)
+        table["unsure"] = classes.unsure
+    words = {"<f4": "float", "<f8": "double", "u1": "uchar", "<i4": "int", "<i2": "short"}
+    names = classes.channel.classes if classes else ()
+    head = ["ply", "format binary_little_endian 1.0", "comment cairn; metres, map frame; kelvin"]
+    head += [f"comment class {number} {name}" for number, name in enumerate(names)] + [f"element vertex {N}"]
     head += [f"property {words[code]} {name}" for name, code in fields] + ["end_header", ""]
     return "\n".join(head).encode() + table.tobytes()
 
 
 def npz_file(voxels: Voxels) -> bytes:
     """Voxels as a compressed NPZ: numbers, centres_m, counts, probability, and per channel mean, weight, spread,
-    and of a dated reading measured_s.
+    and of a dated reading measured_s; of a channel of classes the mean is a number in `names`, and there is unsure.
     """
     arrays: dict[str, npt.NDArray[np.generic]] = {
         "numbers": voxels.numbers,
@@ -95,15 +104,20 @@ def npz_file(voxels: Voxels) -> bytes:
             arrays[f"{name}_spread"] = reading.spread
         if reading.measured_s is not None:
             arrays[f"{name}_measured_s"] = reading.measured_s
+        if reading.unsure is not None:
+            arrays[f"{name}_unsure"], arrays[f"{name}_names"] = reading.unsure, np.array(reading.channel.classes)
     buffer = io.BytesIO()
     np.savez_compressed(buffer, allow_pickle=False, **arrays)
     return buffer.getvalue()
 
 
 def colours(voxels: Voxels) -> npt.NDArray[np.uint8]:
-    """(N, 3) uint8 sRGB; grey where no colour camera looked."""
-    reading = voxels.of_kind(ChannelKind.COLOUR)
+    """(N, 3) uint8 sRGB; grey where no colour camera looked. Of a map without colours, but with classes, theirs."""
+    reading, classes = voxels.of_kind(ChannelKind.COLOUR), voxels.of_kind(ChannelKind.CLASSES)
     rgb = np.full((len(voxels), 3), GREY, np.uint8)
+    if reading is None and classes is not None:
+        seen = classes.weight > 0
+        rgb[seen] = class_colours(len(classes.channel.classes))[classes.mean[seen].astype(np.int64)]
     if reading is not None:
         seen = reading.weight > 0
         rgb[seen] = np.rint(np.clip(reading.mean[seen], 0, 255))

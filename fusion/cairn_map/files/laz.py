@@ -57,6 +57,8 @@ class LazHead:
     """Name of the coordinate system."""
     times: tuple[str, ...] = ()
     """Names of the tables' fields that are times."""
+    numbers: tuple[str, ...] = ()
+    """Names of further fields, single precision."""
 
 
 def laz_parts(head: LazHead, tables: Iterable[Table]) -> Iterator[bytes]:
@@ -80,6 +82,7 @@ def _header(head: LazHead) -> Any:
     header.scales, header.offsets = np.full(3, head.node_edge_m / 2), np.zeros(3)
     header.add_extra_dims([laspy.ExtraBytesParams(name, np.dtype("<f4"), description=EXTRA[name]) for name in EXTRA])
     header.add_extra_dims([laspy.ExtraBytesParams(name, np.dtype("<f8"), description=TIME) for name in head.times])
+    header.add_extra_dims([laspy.ExtraBytesParams(name, np.dtype("<f4"), description=name) for name in head.numbers])
     header.vlrs.append(WktCoordinateSystemVlr(f'LOCAL_CS["{head.frame}",LOCAL_DATUM["local",32767],UNIT["metre",1]]'))
     header.global_encoding.wkt = True
     header.generating_software = "cairn"
@@ -97,7 +100,7 @@ def _rows(table: Table, dtype: np.dtype[np.void], head: LazHead) -> Table:
         rows[name.upper()] = 2 * np.floor(table[name].astype(np.float64) / head.node_edge_m).astype(np.int32) + 1
     for name in ("red", "green", "blue"):
         rows[name] = table[name].astype(np.uint16) * COLOUR_STEP
-    for name in (*EXTRA, *head.times):
+    for name in (*EXTRA, *head.times, *head.numbers):
         rows[name] = table[name]
     rows["bit_fields"] = RETURN
     return rows

@@ -17,6 +17,7 @@ from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey, Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
+from cairn_map.evidence.voxels import reading_of_sums
 from cairn_map.files.cell_files import GREY
 from cairn_map.files.export_request import ExportRequest, chosen_in_cell, chosen_places
 from cairn_map.files.forward_only_file import ForwardOnlyFile
@@ -37,14 +38,23 @@ POINT = np.dtype(
     ]
 )
 """Centre of a node, metres, map frame; 8-bit sRGB, grey where no colour camera looked; kelvin, NaN where unknown."""
+POINT_NAMES = frozenset(POINT.names or ())
 TIMES = {"colour_measured_s": ChannelKind.COLOUR, "temperature_measured_s": ChannelKind.TEMPERATURE}
 """Fields of a map with epochs, and channels whose newest samples below a node they date."""
 DATED_POINT = np.dtype([*POINT.descr, *((name, "<f8") for name in TIMES)])
 """`POINT`, and first instants of epochs, UTC seconds since 1970; NaN where unknown."""
+CLASS_FIELDS = ("class", "unsure")
+"""Fields of a map with classes: number of the class with the most votes below a node, NaN without votes, and 1 where it
+leads by less than two, else 0."""
 PCD_POINT = np.dtype([(name, "<f4") for name in ("x", "y", "z", "rgb", "probability", "temperature", "hottest")])
 """Row of a PCD file: the Point Cloud Library stores colours as 0x00RRGGBB in the bits of a float."""
 DATED_PCD_POINT = np.dtype([*PCD_POINT.descr, *((name, "<f8") for name in TIMES)])
 NPZ_MEMBER = "points.npy"
+
+
+def point_type(plain: np.dtype[np.void], classes: tuple[str, ...]) -> np.dtype[np.void]:
+    """Rows of a table, with the fields of classes if the map has any."""
+    return np.dtype([*plain.descr, *((name, "<f4") for name in CLASS_FIELDS)]) if classes else plain
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,6 +80,8 @@ class About:
     node_edge_m: float
     has_times: bool = False
     """True of a map with epochs: the points have `TIMES`."""
+    classes: tuple[str, ...] = ()
+    """Names of the classes by their numbers, of a map that has such: the points have `CLASS_FIELDS`."""
 
     def __str__(self) -> str:
         times = "; UTC seconds since 1970" if self.has_times else ""
@@ -78,12 +90,17 @@ class About:
     @property
     def point(self) -> np.dtype[np.void]:
         """Rows of the tables."""
-        return DATED_POINT if self.has_times else POINT
+        return point_type(DATED_POINT if self.has_times else POINT, self.classes)
 
     @property
     def pcd_point(self) -> np.dtype[np.void]:
         """Rows of a PCD file."""
-        return DATED_PCD_POINT if self.has_times else PCD_POINT
+        return point_type(DATED_PCD_POINT if self.has_times else PCD_POINT, self.classes)
+
+    @property
+    def comments(self) -> list[str]:
+        """Comments of a file's head: the source, and the name of each class."""
+        return [f"cairn; {self}", *(f"class {number} {name}" for number, name in enumerate(self.classes))]
 
 
 def found_in_cell(
@@ -104,7 +121,10 @@ def points_of_cell(
     """
     chosen = chosen_in_cell(key, evidence, geometry, model, asked)
     view, measured_s = chosen.view, evidence.measured_s
-    table = np.zeros(len(view), POINT if measured_s is None else DATED_POINT)
+    named = next((channel for channel in geometry.channels if channel.classes), None)
+    table = np.zeros(
+        len(view), point_type(POINT if measured_s is None else DATED_POINT, named.classes if named else ())
+    )
     for axis, name in enumerate("xyz"):
         table[name] = chosen.centres_m[:, axis]
     for c, name in enumerate(("red", "green", "blue")):
@@ -114,8 +134,15 @@ def points_of_cell(
     table["temperature"] = table["hottest"] = np.nan
     table["temperature"][view.warm] = view.temperature_k[:, 0]
     table["hottest"][view.warm] = view.temperature_k[:, -1]
+    if measured_s is None and named is None:
+        return table[chosen.rows]
+    rows = view.rows_of(evidence.voxels[evidence.sampled] >> np.uint32(3 * (geometry.depth - view.depth)))
+    if named is not None:
+        votes = np.zeros((len(view), len(named.planes)), np.int64)
+        np.add.at(votes, rows[rows >= 0], evidence.samples[rows >= 0, geometry.planes_of(named.name)])
+        reading = reading_of_sums(named, votes)
+        table["class"], table["unsure"] = reading.mean, reading.unsure
     if measured_s is not None:
-        rows = view.rows_of(evidence.voxels[evidence.sampled] >> np.uint32(3 * (geometry.depth - view.depth)))
         for name, kind in TIMES.items():
             newest = np.full(len(view), np.nan)
             for column in [n for n, channel in enumerate(geometry.channels) if channel.kind is kind][:1]:
@@ -132,8 +159,8 @@ def point_file(form: str, found: PointBounds, tables: Iterable[Table], about: Ab
         from cairn_map.files.laz import LazHead, laz_parts  # its libraries are a server's
 
         low_m, high_m = (found.low_m, found.high_m) if found.count else (np.zeros(3), np.zeros(3))
-        names = tuple(TIMES) if about.has_times else ()
-        head = LazHead(found.count, low_m, high_m, about.node_edge_m, f"map {about.map_name}", names)
+        times, numbers = tuple(TIMES) if about.has_times else (), CLASS_FIELDS if about.classes else ()
+        head = LazHead(found.count, low_m, high_m, about.node_edge_m, f"map {about.map_name}", times, numbers)
         return laz_parts(head, tables)
     return _plain_parts(form, found.count, tables, about)
 
@@ -158,7 +185,12 @@ def _plain(table: Table) -> bytes:
 
 def _ply_head(count: int, about: About) -> bytes:
     words = {"<f4": "float", "<f8": "double", "|u1": "uchar"}
-    lines = ["ply", "format binary_little_endian 1.0", f"comment cairn; {about}", f"element vertex {count}"]
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        *(f"comment {line}" for line in about.comments),
+        f"element vertex {count}",
+    ]
     lines += [f"property {words[about.point[name].str]} {name}" for name in about.point.names or ()]
     return "\n".join([*lines, "end_header", ""]).encode()
 
@@ -167,7 +199,7 @@ def _pcd_head(count: int, about: About) -> bytes:
     point = about.pcd_point
     names = point.names or ()
     lines = [
-        f"# cairn; {about}",
+        *(f"# {line}" for line in about.comments),
         "VERSION 0.7",
         f"FIELDS {' '.join(names)}",
         f"SIZE {' '.join(str(point[name].itemsize) for name in names)}",
@@ -184,7 +216,8 @@ def _pcd_head(count: int, about: About) -> bytes:
 
 
 def _pcd_rows(table: Table) -> bytes:
-    rows = np.empty(len(table), PCD_POINT if table.dtype == POINT else DATED_PCD_POINT)
+    others = [field for field in table.dtype.descr if field[0] not in POINT_NAMES]
+    rows = np.empty(len(table), np.dtype([*PCD_POINT.descr, *others]))
     for name in set(rows.dtype.names or ()) - {"rgb"}:
         rows[name] = table[name]
     red, green, blue = (table[name].astype(np.uint32) for name in ("red", "green", "blue"))

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError, NotFoundError
-from cairn_map.evidence.channels import Channel
+from cairn_map.evidence.channels import Channel, ChannelKind
 from cairn_map.evidence.voxels import Reading
 from cairn_map.queries.frozen_map import as_points
 from cairn_map.queries.map_snapshot import MapSnapshot
@@ -102,6 +102,17 @@ class LayeredSnapshot:
             raise BadInputError("unknown_channel", f"no layer of the map has a channel {channel[:64]!r}")
         return found
 
+    def class_at(self, points_m: npt.ArrayLike) -> Reading:
+        """Classes, as `MapSnapshot.class_at`, of the finest layer with a channel of classes.
+
+        Raises:
+            BadInputError: kind `unknown_channel`: no layer has one.
+        """
+        for layer in self._layers.values():
+            if any(channel.kind is ChannelKind.CLASSES for channel in layer.geometry.channels):
+                return layer.class_at(points_m)
+        raise BadInputError("unknown_channel", "no layer of the map has a channel of classes")
+
     def _answering(self, points_m: npt.ArrayLike) -> npt.NDArray[np.int64]:
         """(N,) place of the finest layer that knows each point; the number of layers where none does."""
         points = as_points(points_m, "points")
@@ -128,7 +139,7 @@ class LayeredSnapshot:
 
 
 def _is_alike(one: Channel, other: Channel) -> bool:
-    return (one.kind, one.unit) == (other.kind, other.unit)
+    return (one.kind, one.unit, one.classes) == (other.kind, other.unit, other.classes)
 
 
 def _filled(fine: Reading, coarse: Reading) -> Reading:
@@ -138,4 +149,8 @@ def _filled(fine: Reading, coarse: Reading) -> Reading:
     spread = fine.spread
     if fine.spread is not None and coarse.spread is not None:
         spread = np.where(take, coarse.spread, fine.spread)
-    return replace(fine, mean=mean, weight=np.where(take, coarse.weight, fine.weight), spread=spread, measured_s=None)
+    unsure = fine.unsure
+    if fine.unsure is not None and coarse.unsure is not None:
+        unsure = np.where(take, coarse.unsure, fine.unsure)
+    weight = np.where(take, coarse.weight, fine.weight)
+    return replace(fine, mean=mean, weight=weight, spread=spread, measured_s=None, unsure=unsure)

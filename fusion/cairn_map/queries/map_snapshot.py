@@ -115,6 +115,12 @@ class MapSnapshot:
         """Mean (N,), standard deviation of the samples (`spread`), kelvin, and weight; first temperature channel."""
         return self._first_at(points_m, ChannelKind.TEMPERATURE)
 
+    def class_at(self, points_m: npt.ArrayLike) -> Reading:
+        """Class with the most votes, of the map's channel of classes: its number (`mean`, (N,), NaN without votes), all
+        votes (`weight`), True where it leads by less than two (`unsure`), and its name (`class_names`).
+        """
+        return self._first_at(points_m, ChannelKind.CLASSES)
+
     def seen_at(self, points_m: npt.ArrayLike) -> Floats:
         """(N,) first instant of the newest epoch in which the voxel was hit or seen through, UTC seconds since 1970.
 

@@ -13,7 +13,7 @@ from cairn_map.errors import BadInputError
 from cairn_map.evidence.channels import Channel, ChannelKind
 from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.inverse_sensor_model import LOG_ODDS_STEP, known, log_odds
-from cairn_map.evidence.voxels import Reading, reading_of_sums
+from cairn_map.evidence.voxels import Reading, joined_readings, reading_of_sums
 from cairn_map.queries import point_kernels as kernels
 from cairn_map.queries.frozen_map import FrozenMap, as_points, check_within
 from cairn_map.queries.occupancy_states import odds_of_counts
@@ -76,6 +76,10 @@ def probability_at(frozen: FrozenMap, points_m: npt.ArrayLike) -> Floats:
 def reading_at(frozen: FrozenMap, points_m: npt.ArrayLike, channel: Channel) -> Reading:
     """Reading of one channel at (N, 3) points."""
     points = as_points(points_m, "points")
+    if channel.kind is ChannelKind.CLASSES and len(points) > CHUNK:
+        # Up to 64 sums a point: chunk by chunk, lest they take more memory than the map.
+        starts = range(0, len(points), CHUNK)
+        return joined_readings([reading_at(frozen, points[start : start + CHUNK], channel) for start in starts])
     planes = frozen.geometry.planes_of(channel.name)
     sums = np.zeros((len(points), planes.stop - planes.start), np.int64)
     for part, slot, rows, places in _located(frozen, points):

@@ -21,7 +21,7 @@ from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.brick_cell import BrickCell
 from cairn_map.evidence.brick_counts import BrickNumbers
-from cairn_map.evidence.channels import ChannelKind
+from cairn_map.evidence.channels import Channel, ChannelKind
 from cairn_map.evidence.compact_cell import HeldCell, has_sums, opened, sums_of
 from cairn_map.evidence.grid import CellKey
 from cairn_map.queries.frozen_map import FrozenMap
@@ -30,7 +30,7 @@ from cairn_map.queries.point_kernels import group_into
 from cairn_map.queries.point_queries import first_of_kind
 from cairn_map.render import render_kernels as kernels
 from cairn_map.render.camera_rays import CameraRays, checked_pose
-from cairn_map.render.node_tables import Table, mean_table, probability_table
+from cairn_map.render.node_tables import Table, drawn_in_colours, mean_table, probability_table
 from cairn_map.render.render_kernels import read_nodes_into
 
 Values = npt.NDArray[np.float32]
@@ -138,11 +138,11 @@ class MapRenderer:
 
     def temperature(self, snapshot: MapSnapshot, seen: SurfaceImage) -> Values:
         """(H, W) kelvin, of the map's first temperature channel; NaN where no temperature is known."""
-        return self._mean(snapshot, seen, ChannelKind.TEMPERATURE, 1)[..., 0]
+        return self._mean(snapshot, seen, first_of_kind(snapshot.geometry, ChannelKind.TEMPERATURE), 1)[..., 0]
 
     def colour(self, snapshot: MapSnapshot, seen: SurfaceImage) -> Values:
-        """(H, W, 3) sRGB 0 to 255, of the map's first colour channel; NaN where no colour is known."""
-        return self._mean(snapshot, seen, ChannelKind.COLOUR, 3)
+        """(H, W, 3) sRGB 0 to 255, of the map's first colour channel, else of its classes; NaN where none is known."""
+        return self._mean(snapshot, seen, drawn_in_colours(snapshot.geometry), 3)
 
     def changed(self, snapshot: MapSnapshot, seen: SurfaceImage, changes: Changes) -> Floats:
         """(H, W) time of the node's last change, in the unit of `changes`; NaN where that is unknown."""
@@ -159,9 +159,9 @@ class MapRenderer:
                 found[rows] = np.where(is_brick, newest, changes[key][blocks])
         return found.reshape(H, W)
 
-    def _mean(self, snapshot: MapSnapshot, seen: SurfaceImage, kind: ChannelKind, planes: int) -> Values:
+    def _mean(self, snapshot: MapSnapshot, seen: SurfaceImage, channel: Channel, planes: int) -> Values:
         # The channel is the key of its table.
-        channel, geometry = first_of_kind(snapshot.geometry, kind), snapshot.geometry
+        geometry = snapshot.geometry
         return self._read(
             snapshot,
             seen,

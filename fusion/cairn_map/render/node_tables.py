@@ -13,11 +13,13 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
-from cairn_map.arrays import Floats
+from cairn_map.arrays import Floats, Ints, Words32
 from cairn_map.evidence.brick_cell import BrickCell
-from cairn_map.evidence.channels import Channel
+from cairn_map.evidence.channels import Channel, ChannelKind, class_colours
 from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel, known
+from cairn_map.evidence.voxels import reading_of_sums
+from cairn_map.queries.point_queries import first_of_kind
 
 Table = npt.NDArray[np.float32]
 """(B, 585, planes) float32; NaN where the node has no value."""
@@ -37,15 +39,45 @@ def probability_table(cell: BrickCell, model: SensorModel) -> Table:
 
 
 def mean_table(cell: BrickCell, channel: Channel, geometry: Geometry) -> Table:
-    """Table of the mean of a channel's samples in its unit, one plane; three for colours."""
+    """Table of the mean of a channel's samples in its unit, one plane; three for colours, and for those of classes."""
     places, samples = cell.samples.packed()
     sums = samples[:, geometry.planes_of(channel.name)]
+    if channel.kind is ChannelKind.CLASSES:
+        return _class_table(cell, channel, places, sums)
     dense = np.zeros((len(cell.counts.pool) * 512, channel.value_count + 1))
     rows = cell.counts.brick_of[places >> np.uint32(9)].astype(np.int64) * 512 + (places & np.uint32(511))
     dense[rows, :-1], dense[rows, -1] = sums[:, : channel.value_count], sums[:, -1]
     added = _pyramid(dense, lambda parts: parts.sum(axis=2))
     weight = np.where(added[..., -1:] > 0, added[..., -1:], np.nan)
     return np.asarray(added[..., :-1] / weight * channel.step + channel.zero, np.float32)
+
+
+def drawn_in_colours(geometry: Geometry) -> Channel:
+    """Channel by which a map is drawn in colours: the first of colours; in a map without any that of classes.
+
+    Raises:
+        BadInputError: kind `unknown_channel`: it has neither.
+    """
+    kinds = {channel.kind for channel in geometry.channels}
+    is_classed = ChannelKind.CLASSES in kinds and ChannelKind.COLOUR not in kinds
+    return first_of_kind(geometry, ChannelKind.CLASSES if is_classed else ChannelKind.COLOUR)
+
+
+def _class_table(cell: BrickCell, channel: Channel, places: Words32, sums: Ints) -> Table:
+    """Table of the colours of classes, three planes; a larger node has the colour of its part with the most votes."""
+    reading = reading_of_sums(channel, sums)
+    rows = cell.counts.brick_of[places >> np.uint32(9)].astype(np.int64) * 512 + (places & np.uint32(511))
+    dense = np.zeros((len(cell.counts.pool) * 512, 4))
+    seen = reading.weight > 0
+    dense[rows[seen], :3] = class_colours(len(channel.classes))[reading.mean[seen].astype(np.int64)]
+    dense[rows, 3] = reading.weight
+
+    def with_most(parts: Floats) -> Floats:
+        best = parts[..., 3].argmax(axis=2)[..., None, None]
+        return np.take_along_axis(parts, best, axis=2)[:, :, 0]
+
+    found = _pyramid(dense, with_most)
+    return np.where(found[..., 3:] > 0, found[..., :3], np.nan).astype(np.float32)
 
 
 def _pyramid(voxels: Floats, join: Callable[[Floats], Floats]) -> Floats:

@@ -21,7 +21,7 @@ from cairn_map.queries.occupancy_states import CellStates, bricks_of, state_grid
 from cairn_map.queries.point_queries import first_of_kind
 from cairn_map.render.camera_rays import CameraRays
 from cairn_map.render.map_render import CellTables, MapRenderer, SurfaceImage
-from cairn_map.render.node_tables import Table, mean_table, probability_table
+from cairn_map.render.node_tables import Table, drawn_in_colours, mean_table, probability_table
 from cairn_map.render.render_picture import Layer
 
 ALL_OCCUPIED = np.full((1, 8, 2), ~np.uint64(0), np.uint64)
@@ -67,8 +67,8 @@ def read_cell(cell: BrickCell, geometry: Geometry, model: SensorModel, layer: La
         case Layer.PROBABILITY:
             table = {model: probability_table(cell, model)}
         case Layer.TEMPERATURE | Layer.COLOUR:
-            kind = ChannelKind.TEMPERATURE if layer is Layer.TEMPERATURE else ChannelKind.COLOUR
-            channel = first_of_kind(geometry, kind)
+            is_warmth = layer is Layer.TEMPERATURE
+            channel = first_of_kind(geometry, ChannelKind.TEMPERATURE) if is_warmth else drawn_in_colours(geometry)
             table = {channel: mean_table(cell, channel, geometry)}
     zeros = cell.zeros()
     states = CellStates(sums_of(zeros), bricks_of(cell.counts), words_of_cell(cell, model))

@@ -5,11 +5,14 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field
 
 from cairn_map.epochs.layer import EVIDENCE, EpochLength, LayerDefinition, LayerName
+from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.grid import Geometry
 from cairn_map.wire.messages import IdText, MapInfo, MapNameText
 
 LAYER_FORMAT = 4
 """`Cairn-Format` from which on a client knows of layers: to others a server names none in its list of maps."""
+CLASSES_FORMAT = 5
+"""The same of layers with a channel of classes, in lists of maps and of layers."""
 
 
 class _Model(BaseModel):
@@ -55,6 +58,11 @@ class LayerAdded(_Model):
     commit: IdText | None
     """Commit that defines the layer; None: an equal one was there."""
     layer: LayerInfo
+
+
+def is_listed(geometry: Geometry, known: int) -> bool:
+    """True if a client of a `Cairn-Format` can read the grid of a layer; others refuse a whole list for one channel."""
+    return known >= CLASSES_FORMAT or all(channel.kind is not ChannelKind.CLASSES for channel in geometry.channels)
 
 
 def layer_info(info: MapInfo) -> LayerInfo:

@@ -10,6 +10,8 @@ from cairn_map.wire.messages import CursorText, IdText
 Triple = tuple[int, int, int]
 MeasuredOrNone = Annotated[float | None, Field(exclude_if=lambda value: value is None)]
 """Time of samples; a client of the release before does not know it, nor any map that has it."""
+ClassOrNone = Annotated[str | None, Field(exclude_if=lambda value: value is None)]
+UnsureOrNone = Annotated[bool | None, Field(exclude_if=lambda value: value is None)]
 
 
 class _Model(BaseModel):
@@ -30,6 +32,10 @@ class ChannelReading(_Model):
     """Standard uncertainty of one sample, the samples' spread and the camera's own; None but for temperatures."""
     measured_s: MeasuredOrNone = None
     """First instant of the epoch of the newest samples, UTC seconds since 1970; None, and not in JSON: unknown."""
+    class_name: ClassOrNone = None
+    """Class with the most votes, whose number is the mean; None, and not in JSON: no votes, or another kind."""
+    unsure: UnsureOrNone = None
+    """True if the class leads the next by less than two votes; None, and not in JSON, as `class_name`."""
 
 
 class VoxelCommit(_Model):

@@ -140,7 +140,8 @@ class _PointFile:
         self.row, self.asked, self.until_s = row, asked, _until_s(asked)
         self._found = PointBounds()
         edge_m = node_geometry(row.geometry, asked).voxel_edge_m
-        self._about = About(row.name, edge_m, has_times=row.layer.has_epochs)
+        classes = next((channel.classes for channel in row.geometry.channels if channel.classes), ())
+        self._about = About(row.name, edge_m, has_times=row.layer.has_epochs, classes=classes)
 
     def kept(self, key: CellKey, body: bytes, evidence: Evidence) -> bytes:
         """Bytes of a cell to be laid aside; empty if it has nothing that is asked for."""

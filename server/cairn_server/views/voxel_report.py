@@ -112,6 +112,8 @@ def _reading(reading: Reading, channel: Channel) -> ChannelReading:
         mean=[float(value) for value in reading.mean.ravel()] if weight else [],
         sigma=float(reading.sigma[0]) if weight and reading.sigma is not None else None,
         measured_s=measured_or_none(reading, 0) if weight else None,
+        class_name=reading.name_at(0) if weight else None,
+        unsure=bool(reading.unsure[0]) if weight and reading.unsure is not None else None,
     )
 
 

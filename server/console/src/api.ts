@@ -109,7 +109,7 @@ export class Api {
   async ask(path: string, options: RequestInit = {}): Promise<Response> {
     const headers = new Headers(options.headers);
     // A client of maps with epochs hears the server's time, too, while the server trusts it, and one of layers their names.
-    headers.set("Cairn-Format", "4");
+    headers.set("Cairn-Format", "5");
     if (this.token) headers.set("Authorization", `Bearer ${this.token}`);
     let answer: Response;
     try {

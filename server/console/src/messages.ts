@@ -1,7 +1,7 @@
 /** The JSON that the server speaks: server/PROTOCOL.md sections 3 and 4.6. */
 
 export interface Channel {
-  kind: "colour" | "intensity" | "temperature" | "scalar";
+  kind: "colour" | "intensity" | "temperature" | "scalar" | "classes";
   name: string;
   unit: string;
   step: number;

@@ -6,12 +6,16 @@ from pathlib import Path
 import pytest
 from tests.fixtures.client.joined import Server, mapped, settled
 from tests.fixtures.client.made import GEOMETRY, MAP, seen
+from tests.fixtures.map.classed import CLASSED, classed_evidence
 from tests.fixtures.server.live import until
 from tests.fixtures.server.stores import one_server
 
+from cairn_client.replica.outbox import CommitFacts
 from cairn_client.robot.robot import Robot
+from cairn_map.codec.cell_code import cell_digest
 from cairn_map.commits.commit import CommitMeta
 from cairn_map.epochs.layer import LayerDefinition
+from cairn_map.evidence.brick_cell import sum_evidence
 from cairn_map.evidence.grid import Geometry, cell_key
 from cairn_map.wire.layer_messages import AddLayer
 from cairn_server.access.auth import ADMIN_FILE
@@ -111,3 +115,20 @@ def test_layers_of_one_name_that_differ_stay_apart_and_all_else_goes_on(
         [LayerDefinition(name="fine", geometry=WIDE)],
     )
     assert (len(digests(base)), len(digests(field))) == (0, 1)
+
+
+@one_server("one of them is given other settings")
+def test_votes_for_classes_add_up_on_all_servers(base: Server, field: Server, tmp_path: Path) -> None:
+    add(base, CLASSED)
+    field.join(base)
+    settled(base, field)
+    until(lambda: layers(base) == layers(field) == [(LAYER, CLASSED)], "both have the layer")
+    votes = [classed_evidence(seed, CLASSED) for seed in (1, 2)]
+    for server, name, evidence in ((field, "near", votes[0]), (base, "far", votes[1])):
+        token = server.token(f"{name}-of-layer", role="robot", map=MAP, robot=name)
+        url = f"{server.url}/maps/{LAYER}"
+        with Robot(None, url, directory=tmp_path / name, name=name, token=token, geometry=CLASSED) as robot:
+            robot.replica.commit({cell_key((0, 0, 0)): evidence}, CommitFacts(sensors=("a", "b", "c")))
+            robot.sync()
+    whole = cell_digest(cell_key((0, 0, 0)), sum_evidence(votes, CLASSED), CLASSED)
+    until(lambda: [*digests(base).values()] == [*digests(field).values()] == [whole], "both have all votes")

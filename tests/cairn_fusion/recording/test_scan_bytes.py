@@ -25,6 +25,8 @@ def random_scan(seed: int) -> Scan:
         amplitude=rng.integers(0, 1 << 16, (6, 8)).astype(np.uint16) if seed % 2 else None,
         colour={name: rng.integers(0, 256, (5, 4, 3)).astype(np.uint8) for name in ("left", "right")[: seed % 3]},
         thermal={"far": rng.uniform(250, 400, (3, 7)).astype(np.float32)} if seed % 2 else {},
+        labels={"left": rng.integers(0, 9, (5, 4)).astype(np.uint16)} if seed % 3 else {},
+        label_names={0: None, 7: "wall"} if seed % 3 else {},
         scalars={"dose": float(rng.normal())},
         T_map_body=look_at(rng.normal(size=3), rng.normal(size=3)) if seed % 4 else None,
     )

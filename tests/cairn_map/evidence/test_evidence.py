@@ -125,7 +125,8 @@ def test_bounds_of_counts_are_those_of_every_row(seed: int, rows: int) -> None:
     )
 
 
-SPEC = np.array([[2, 0], [3, 1]])
+SPEC = np.array([[2, 0, 0], [3, 1, 0]])
+SPEC_OF_CLASSES = np.array([[2, 0, 0], [3, 0, 1]])
 """Two channels: a sum and a weight; a sum, a square sum and a weight."""
 
 
@@ -134,6 +135,10 @@ def test_a_sum_without_weight_is_found_in_any_row(seed: int, rows: int) -> None:
     samples = np.random.default_rng(seed).choice([0, 0, 1, -1, 1 << 62], (rows, 5), p=[0.4, 0.3, 0.1, 0.1, 0.1])
     expected = any((w == 0 and s != 0) or (v == 0 and (t or q)) for s, w, t, q, v in samples.tolist())
     assert sums_without_weight(samples, SPEC) == expected
+    # Of classes the votes for the named ones are no more than all.
+    more = any((v == 0 and (t or q)) or (v != 0 and (t > v or t + q > v)) for _, _, t, q, v in samples.tolist())
+    first = any(w == 0 and s != 0 for s, w, *_ in samples.tolist())
+    assert sums_without_weight(samples, SPEC_OF_CLASSES) == (first or more)
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(0, 4))

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.fixtures.map.classed import CLASSED
 from tests.fixtures.map.made import MIDDLE, PLAIN, SMALL, commit_bytes
 from tests.fixtures.map.stored import recoded
 from tests.fixtures.server.answers import kind_of
@@ -79,6 +80,18 @@ def test_a_commit_counts_at_most_once_per_voxel_and_scan(
     answer = live.push(live.new_map(PLAIN), with_counts(hits, misses, scans=scans))
     assert answer.status_code == status
     assert status == 201 or kind_of(answer) == "too_much_evidence"
+
+
+def test_a_commit_has_one_vote_for_a_class_per_voxel_and_sensor(live: Live) -> None:
+    for votes, sensors, status in (
+        ([4, 0, 0, 4], (), 201),
+        ([5, 0, 0, 5], (), 400),
+        ([0, 0, 8, 8], ("a", "b"), 201),
+        ([0, 0, 0, 9], ("a", "b"), 400),
+    ):
+        evidence = packed_evidence(np.array([3], np.uint32), np.array([[1, 0]]), np.array([votes]), CLASSED)
+        commit = pushed(0, 0, geometry=CLASSED, cells={KEYS[0]: evidence}, sensors=sensors)
+        assert live.push(live.new_map(CLASSED), commit).status_code == status
 
 
 @pytest.mark.parametrize("plane", range(SMALL.plane_count))

@@ -19,7 +19,8 @@ temperatures degrees Celsius here and kelvin in JSON; unknown values are `-`, in
 have the time at which they were seen last, too, and readings the count of their samples and the time of the newest: the
 beginning of its epoch, UTC.
 Of a map with layers (`cairn map layer`) each point is read in the finest layer that knows it, which is named; all other
-questions are asked of one layer: of the map's URL its first one, of MAP.LAYER that one.
+questions are asked of one layer: of the map's URL its first one, of MAP.LAYER that one. In a layer of classes points
+have the class with the most votes, marked as unsure where it leads by less than two; in JSON `mean` is its number.
 --json prints JSON for programs; `slice` and `height` then give all pixels, rows along y and columns along x.
 """
 
@@ -291,6 +292,8 @@ def _value(reading: Reading, n: int) -> dict[str, Any] | None:
         return None
     value = {"mean": reading.mean[n].tolist(), "unit": reading.channel.unit, "weight": int(reading.weight[n])}
     value |= {} if reading.measured_s is None else {"measured_s": _or_none(reading.measured_s[n])}
+    if reading.unsure is not None:
+        value |= {"class": reading.name_at(n), "unsure": bool(reading.unsure[n])}
     if reading.spread is None or reading.sigma is None:
         return value
     return value | {"spread": float(reading.spread[n]), "sigma": float(reading.sigma[n])}
@@ -320,6 +323,8 @@ def _whence(samples: int, measured_s: float) -> str:
 
 def _shown_mean(reading: Reading, n: int) -> str:
     mean = reading.mean[n]
+    if reading.unsure is not None:
+        return f"{reading.name_at(n)}{' (unsure)' if reading.unsure[n] else ''}"
     if reading.channel.kind is ChannelKind.COLOUR:
         return "({:.0f} {:.0f} {:.0f})".format(*mean)
     if reading.channel.kind is ChannelKind.TEMPERATURE and reading.sigma is not None:

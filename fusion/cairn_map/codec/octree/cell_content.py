@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from cairn_map.codec.octree import channel_streams
 from cairn_map.codec.octree.octree import Octree, build_octree
 from cairn_map.codec.octree.octree_kernels import check_leaves, expand_content_into, leaves_of_rows
 from cairn_map.codec.octree.streams import column_planes, encode_column, required
+from cairn_map.codec.octree.word_columns import numbers_into, words
 from cairn_map.errors import DamagedDataError
 from cairn_map.evidence.evidence import COUNT_MAX, Evidence
 from cairn_map.evidence.grid import Geometry
@@ -122,7 +122,7 @@ def topology_streams(octree: Octree) -> dict[int, bytes]:
 def count_streams(counts: npt.NDArray[np.int32], *, signed: bool) -> dict[int, bytes]:
     """Raw streams of the leaves' hits and misses."""
     return {
-        number: encode_column(channel_streams.words(counts[:, column].astype(np.int64), signed))
+        number: encode_column(words(counts[:, column].astype(np.int64), signed))
         for number, column in ((HITS, 0), (MISSES, 1))
     }
 
@@ -139,5 +139,5 @@ def counts_of_streams(
     counts = np.empty((stop - first, 2), np.int32)
     for number, column in ((HITS, 0), (MISSES, 1)):
         planes = column_planes(required(streams, number), rows=leaves)[:, first:stop]
-        channel_streams.numbers_into(counts[:, column], planes, signed=signed, limit=COUNT_MAX)
+        numbers_into(counts[:, column], planes, signed=signed, limit=COUNT_MAX)
     return counts

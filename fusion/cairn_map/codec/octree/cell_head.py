@@ -11,7 +11,7 @@ from functools import lru_cache
 from pydantic import ValidationError
 
 from cairn_map.errors import BadInputError, DamagedDataError
-from cairn_map.evidence.channels import CODE_OF_KIND, Channel
+from cairn_map.evidence.channels import CODE_OF_KIND, Channel, ChannelKind
 from cairn_map.evidence.grid import CELL_LIMIT, CellKey, Geometry, cell_key, cell_of_key
 
 MAGIC = b"CRNC"
@@ -23,6 +23,7 @@ INDICES_AT = struct.calcsize("<4sBBBBI")
 """Offset of the three indices of the cell, bytes."""
 CHANNEL_SIZES = struct.Struct("<BBB")
 CHANNEL_SCALE = struct.Struct("<dd")
+LENGTH = struct.Struct("<B")
 KIND_OF_CODE = {code: kind for kind, code in CODE_OF_KIND.items()}
 
 
@@ -43,7 +44,9 @@ class CellHead:
 
         Every inner node has a leaf of its own below it at each depth, so no depth has more inner nodes than leaves.
         """
+        # Votes for classes have a column of classes more, and one of how many there are in a row.
         columns = 2 + self.geometry.plane_count
+        columns += sum(channel.value_count + 1 for channel in self.geometry.channels if channel.classes)
         masks = (2 * self.geometry.depth - 1) * self.leaves
         presence = len(self.geometry.channels) * ((self.leaves + 7) // 8)
         return masks + presence + columns * (1 + 8 * self.leaves)
@@ -74,6 +77,9 @@ def channels_to_bytes(geometry: Geometry) -> bytes:
         name, unit = channel.name.encode(), channel.unit.encode()
         data += CHANNEL_SIZES.pack(CODE_OF_KIND[channel.kind], len(name), len(unit)) + name + unit
         data += CHANNEL_SCALE.pack(channel.step, channel.zero)
+        if channel.kind is ChannelKind.CLASSES:
+            texts = [one.encode() for one in channel.classes]
+            data += bytes([len(texts)]) + b"".join(bytes([len(text)]) + text for text in texts)
     return data
 
 
@@ -132,8 +138,10 @@ def end_of_channels(data: bytes, at: int, count: int) -> int:
         struct.error: cut off.
     """
     for _ in range(count):
-        _, name_bytes, unit_bytes = CHANNEL_SIZES.unpack_from(data, at)
+        code, name_bytes, unit_bytes = CHANNEL_SIZES.unpack_from(data, at)
         at += CHANNEL_SIZES.size + name_bytes + unit_bytes + CHANNEL_SCALE.size
+        if code == CODE_OF_KIND[ChannelKind.CLASSES]:
+            _, at = _classes(data, at)
     return at
 
 
@@ -174,5 +182,23 @@ def _channel(data: bytes, at: int) -> tuple[Channel, int]:
     name, unit = data[at : at + name_bytes], data[at + name_bytes : at + name_bytes + unit_bytes]
     at += name_bytes + unit_bytes
     step, zero = CHANNEL_SCALE.unpack_from(data, at)
+    at += CHANNEL_SCALE.size
+    classes: list[str] = []
+    if code == CODE_OF_KIND[ChannelKind.CLASSES]:
+        classes, at = _classes(data, at)
     fields = {"kind": KIND_OF_CODE.get(code), "name": name.decode(), "unit": unit.decode(), "step": step, "zero": zero}
-    return Channel.model_validate(fields), at + CHANNEL_SCALE.size
+    return Channel.model_validate(fields | {"classes": classes}), at
+
+
+def _classes(data: bytes, at: int) -> tuple[list[str], int]:
+    """Names of a channel's classes, and the offset behind them; each has its length before it."""
+    (count,) = LENGTH.unpack_from(data, at)
+    at += LENGTH.size
+    names: list[str] = []
+    for _ in range(count):
+        (length,) = LENGTH.unpack_from(data, at)
+        at += LENGTH.size + length
+        if at > len(data):
+            raise struct.error("the names of classes are cut off")
+        names.append(data[at - length : at].decode())
+    return names, at

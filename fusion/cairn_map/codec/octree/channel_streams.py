@@ -5,6 +5,7 @@
     square    residual against the sum of squares of equal samples
 
 Streams of channel c start at number 16 + 8 c: presence, weight, then the value planes in order (FORMAT.md section 6).
+Votes for classes have streams of their own in place of the value planes (`vote_streams`).
 """
 
 from dataclasses import dataclass
@@ -12,8 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from cairn_map.arrays import Ints, Words
-from cairn_map.codec.octree.streams import column_planes, encode_column, required, words_of_planes
+from cairn_map.arrays import Ints
+from cairn_map.codec.octree import vote_streams
+from cairn_map.codec.octree.streams import column_planes, encode_column, required
 from cairn_map.codec.octree.sum_kernels import (
     place_sums_into,
     predict_sums,
@@ -21,17 +23,14 @@ from cairn_map.codec.octree.sum_kernels import (
     restore_sums_into,
     square_guesses,
 )
+from cairn_map.codec.octree.word_columns import numbers_into, words, zigzag
 from cairn_map.errors import BadInputError, DamagedDataError
-from cairn_map.evidence.channels import Channel
+from cairn_map.evidence.channels import Channel, ChannelKind
 from cairn_map.evidence.evidence import SUM_MAX
 from cairn_map.evidence.grid import Geometry
 
-Planes = npt.NDArray[np.uint8]
-
 FIRST_STREAM = 16
 STREAMS_PER_CHANNEL = 8
-SMALL_PLANES = 3
-"""Bytes of a number that is certainly in range."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,6 +44,11 @@ class ChannelRows:
 def stream_of_channel(c: int) -> int:
     """Number of the first stream of the channel number c."""
     return FIRST_STREAM + STREAMS_PER_CHANNEL * c
+
+
+def stream_count(channel: Channel) -> int:
+    """Number of a channel's streams."""
+    return 2 + (vote_streams.STREAMS if channel.kind is ChannelKind.CLASSES else len(channel.planes) - 1)
 
 
 def split_samples(sampled: Ints, samples: Ints, geometry: Geometry) -> list[ChannelRows]:
@@ -88,11 +92,13 @@ def encode_channel(number: int, channel: Channel, rows: ChannelRows, *, leaves: 
     weights = planes[-1]
     streams = {number: np.packbits(bits, bitorder="little").tobytes()}
     streams[number + 1] = encode_column(words(weights, signed))
+    if channel.kind is ChannelKind.CLASSES:
+        return streams | vote_streams.encode_votes(number + 2, rows.sums[:, :-1], signed=signed)
     for p in range(channel.value_count):
         streams[number + 2 + p] = encode_column(predict_sums(planes[p], weights))
     if "square_sum" in channel.planes:
         guesses = square_guesses(planes[0], weights)
-        streams[number + 3] = encode_column(_zigzag(planes[1].astype(np.uint64) - guesses))
+        streams[number + 3] = encode_column(zigzag(planes[1].astype(np.uint64) - guesses))
     return streams
 
 
@@ -119,6 +125,12 @@ def decode_channel(
     count = len(present)
     check_count(count, sampled_max)
     last = count if stop is None else int(np.searchsorted(present, stop))
+    if channel.kind is ChannelKind.CLASSES:
+        sums = np.zeros((last, len(channel.planes)), np.int64)
+        weights = column_planes(required(streams, number + 1), rows=count)
+        numbers_into(sums[:, -1], weights[:, :last], signed=signed, limit=SUM_MAX)
+        vote_streams.decode_votes_into(sums[:, :-1], number + 2, streams, rows=count, signed=signed)
+        return ChannelRows(present[:last], sums)
     sums = np.empty((last, len(channel.planes)), np.int64)
     columns = [column_planes(required(streams, number + 1 + p), rows=count) for p in range(len(channel.planes))]
     numbers_into(sums[:, -1], columns[0][:, :last], signed=signed, limit=SUM_MAX)
@@ -127,31 +139,6 @@ def decode_channel(
     if "square_sum" in channel.planes:
         restore_squares_into(sums, columns[2])
     return ChannelRows(present[:last], sums)
-
-
-def words(values: Ints, signed: bool) -> Words:
-    """Counts and weights as words: unchanged, or zigzag where differences may be negative."""
-    raw = values.astype(np.uint64)
-    return _zigzag(raw) if signed else raw
-
-
-def numbers_into(out: npt.NDArray[np.signedinteger], planes: Planes, *, signed: bool, limit: int) -> None:
-    """Write (N,) numbers of the (k, N) planes of `column_planes`; the mirror of `words`.
-
-    Raises:
-        DamagedDataError: a magnitude above `limit`, which is no less than three bytes hold.
-    """
-    if not signed and len(planes) <= SMALL_PLANES:
-        out[:] = planes[0] if len(planes) else 0
-        for p, plane in enumerate(planes[1:], 1):
-            out |= plane.astype(out.dtype) << out.dtype.type(8 * p)
-        return
-    raw = words_of_planes(planes)
-    # As int64 a word of 2^63 and more is negative: out of range, too.
-    values = (_unzigzag(raw) if signed else raw).view(np.int64)
-    if len(values) and (values.max() > limit or values.min() < (-limit if signed else 0)):
-        raise DamagedDataError("bad_stream", f"a count or weight is beyond {limit}")
-    out[:] = values
 
 
 def check_count(count: int, sampled_max: int) -> None:
@@ -177,11 +164,3 @@ def _presence(raw: bytes, leaves: int) -> npt.NDArray[np.bool_]:
     if bits[leaves:].any():
         raise DamagedDataError("bad_stream", "presence bits beyond the last leaf must be 0")
     return bits[:leaves].view(np.bool_)
-
-
-def _zigzag(raw: Words) -> Words:
-    return (raw << np.uint64(1)) ^ (np.uint64(0) - (raw >> np.uint64(63)))
-
-
-def _unzigzag(raw: Words) -> Words:
-    return (raw >> np.uint64(1)) ^ (np.uint64(0) - (raw & np.uint64(1)))

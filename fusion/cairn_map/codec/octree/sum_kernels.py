@@ -1,6 +1,7 @@
 """Prediction of columns of sums: each row is guessed from the row before, and the residual is stored.
 
-FORMAT.md section 5 is the norm. All arithmetic is on words mod 2^64, so that every number has a residual.
+FORMAT.md section 5 is the norm; votes for classes, without a guess, are those of section 6. All arithmetic is on
+words mod 2^64, so that every number has a residual.
 """
 
 import numba as nb
@@ -112,3 +113,41 @@ def zigzag(word: np.uint64) -> np.uint64:
 def unzigzag(word: np.uint64) -> np.uint64:
     """Two's complement word of a zigzag word; the mirror of `zigzag`."""
     return (word >> np.uint64(1)) ^ (np.uint64(0) - (word & np.uint64(1)))
+
+
+@nb.njit(cache=True, nogil=True)
+def place_votes_into(
+    sums: npt.NDArray[np.int64], pairs: Planes, classes: Planes, votes: Planes, signed: bool, limit: int
+) -> bool:
+    """Write votes where they belong; False if a class is not there, or does not rise in its row, or a number is wrong.
+
+    Args:
+        sums: (first rows, named classes) zeros, changed.
+        pairs: (rows,) classes with votes; together they are M.
+        classes: (M,) their numbers.
+        votes: (k, M) planes of bytes of their votes, the lowest first.
+        signed: True if votes are zigzag numbers.
+        limit: largest magnitude.
+    """
+    at = 0
+    for row in range(len(pairs)):
+        last = -1
+        for _ in range(pairs[row]):
+            # The word of the votes, then its number.
+            word = np.uint64(0)
+            for p in range(votes.shape[0]):
+                word |= np.uint64(votes[p, at]) << np.uint64(8 * p)
+            is_negative = signed and (word & np.uint64(1)) != 0
+            magnitude = word >> np.uint64(1) if signed else word
+            if is_negative:
+                magnitude += np.uint64(1)
+            if magnitude == 0 or magnitude > np.uint64(limit):
+                return False
+            number = classes[at]
+            if number <= last or number >= sums.shape[1]:
+                return False
+            if row < len(sums):
+                sums[row, number] = -np.int64(magnitude) if is_negative else np.int64(magnitude)
+            last = number
+            at += 1
+    return True

@@ -6,7 +6,7 @@ from fastapi import APIRouter, Depends, Query, Response
 
 from cairn_map.commits.commit import EPOCH_VERSION
 from cairn_map.errors import BadInputError
-from cairn_map.wire.layer_messages import LAYER_FORMAT, AddLayer, LayerAdded, LayerInfo
+from cairn_map.wire.layer_messages import LAYER_FORMAT, AddLayer, LayerAdded, LayerInfo, is_listed
 from cairn_map.wire.live_events import NAMES_MAX
 from cairn_map.wire.mark_messages import PAGE_MAX, MarkPage, MarkReceipt, MarkRequest
 from cairn_map.wire.messages import CreateMap, LogEntry, MapDeleted, MapInfo, MapSizes, Retract, Retracted
@@ -28,6 +28,7 @@ def list_maps(
     rows = [row for row in service.store.maps() if caller.counts_on(row)]
     if known < LAYER_FORMAT:  # such clients refuse the whole list for the name of a layer
         rows = [row for row in rows if row.of_map is None]
+    rows = [row for row in rows if is_listed(row.geometry, known)]
     return [_known_facts(service.maps.info(row), known) for row in rows]
 
 
@@ -97,9 +98,9 @@ def _known_facts(info: MapInfo, known: int) -> MapInfo:
 
 
 @router.get("/maps/{name}/layers", dependencies=READERS)
-def list_layers(service: Operations, row: Map) -> list[LayerInfo]:
-    """The layers of a map: the one that it began with, then the others by name."""
-    return service.sync.layers.list(row)
+def list_layers(service: Operations, row: Map, known: Format) -> list[LayerInfo]:
+    """The layers of a map that the client can read: the one that it began with, then the others by name."""
+    return [layer for layer in service.sync.layers.list(row) if is_listed(layer.geometry, known)]
 
 
 @router.post(

@@ -17,7 +17,7 @@ from cairn_map.commits.ids import INITIAL, OPERATOR
 from cairn_map.commits.mark import check_place
 from cairn_map.epochs.epoch import Epoch, begin_s, epoch_of
 from cairn_map.errors import BadInputError, DamagedDataError, DeniedError, UnreachableError
-from cairn_map.evidence.channels import SAMPLE_MAX, planes_and_squares
+from cairn_map.evidence.channels import SAMPLE_MAX, VOTE_MAX, planes_and_squares
 from cairn_map.evidence.evidence_kernels import bounds_of_counts, channel_above
 from cairn_map.evidence.grid import Geometry, cell_of_key
 from cairn_server.access.auth import Caller
@@ -154,19 +154,22 @@ def check_evidence(meta: CommitMeta, cell: CanonicalCell, tops: npt.NDArray[np.i
     if meta.commit_id.author.robot == INITIAL:
         return
     scans = max(1, len(meta.scans))
-    complaint = _excess(cell.content, cell.geometry, tops, scans)
+    complaint = _excess(cell.content, cell.geometry, tops, scans, cameras=max(1, len(meta.sensors)))
     if complaint:
         raise BadInputError("too_much_evidence", f"cell {cell_of_key(cell.key)}: {complaint} from {scans} scans")
 
 
-def _excess(content: CellContent, geometry: Geometry, tops: npt.NDArray[np.int64], scans: int) -> str | None:
+def _excess(
+    content: CellContent, geometry: Geometry, tops: npt.NDArray[np.int64], scans: int, *, cameras: int
+) -> str | None:
     """Description of the first excess in a cell; None: there is none."""
     counts = bounds_of_counts(content.counts)[3]
     if counts > scans:
         return f"{counts} counts in one voxel"
     for channel in geometry.channels:
         weight = int(tops[1 + geometry.planes_of(channel.name).stop])
-        if weight > scans:  # one sample of weight 1 a scan, as there is one count (decision 002)
+        # One sample of weight 1 a scan, as there is one count (decision 002); of classes one vote a camera (042).
+        if weight > (VOTE_MAX * cameras if channel.classes else scans):
             return f"weight {weight} of {channel.name} in one voxel"
     # Weights are at most 2^12 here and a square below 2^40, so that the products fit.
     above = channel_above(content.samples, planes_and_squares(geometry.channels), SAMPLE_MAX)

@@ -14,6 +14,9 @@ export interface ChannelReading {
   weight: number;
   mean: number[];
   sigma: number | null;
+  /** Of a channel of classes: the one with the most votes, and whether it leads by less than two. */
+  class_name?: string;
+  unsure?: boolean;
   /** Time of the newest samples, in seconds; left out: unknown. */
   measured_s?: number;
 }
@@ -112,11 +115,12 @@ function exact(answer: VoxelAnswer): HTMLElement {
     ["centre", answer.centre_m.map((value) => value.toFixed(3)).join(", ") + " m"],
     ["probability", answer.probability === null ? "unknown" : answer.probability.toFixed(4)],
     ["seen", `${answer.hits} of ${seen} scans hit it`],
-    ...answer.channels.map(({ name, kind, unit, mean, sigma, weight, measured_s }): [string, Node | string] => {
+    ...answer.channels.map(({ name, kind, unit, mean, sigma, weight, measured_s, class_name, unsure }): [string, Node | string] => {
       if (!weight) return [name, "none measured"];
       const when = measured_s === undefined ? "" : `, ${clock(measured_s)}, ${ago(serverNowS() - measured_s)}`;
       const whence = `(${counted(weight, "sample", "samples")}${when})`;
       if (kind === "colour") return [name, h("span", {}, swatch(mean), ` ${mean.map((value) => value.toFixed(1)).join(", ")} ${whence}`)];
+      if (class_name !== undefined) return [name, `${class_name}${unsure ? " (unsure)" : ""} ${whence.replace("sample", "vote")}`];
       const spread = sigma === null ? "" : ` ± ${sigma.toFixed(2)} ${unit === "K" ? "°C" : unit}`;
       const value = unit === "K" ? celsius(mean[0], 2) : `${mean[0].toFixed(2)} ${unit}`;
       return [name, `${value}${spread} ${whence}`];
