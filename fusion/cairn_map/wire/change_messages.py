@@ -77,4 +77,4 @@ class RetractChanges(_Model):
     warmer: list[CellVoxels]
     colder: list[CellVoxels]
     otherwise: list[CellVoxels]
-    """Of another probability or colour, or with a temperature in one of the two alone."""
+    """Voxels of another probability or colour, or with a temperature in one of the two alone."""

@@ -1,4 +1,4 @@
-"""What a retract would change in a map: each voxel that would be shown otherwise, before anything is taken out.
+"""Preview of a retract in a map: each voxel that would be shown otherwise, before anything is taken out.
 
     cell as it is          -->  its view
     cell less the commits  -->  its view      gone, appeared, warmer, colder, otherwise: exactly what differs
