@@ -73,6 +73,7 @@ from cairn_server.views.hottest_search import HottestSearch
 from cairn_server.views.map_changes import MapChangesSearch
 from cairn_server.views.map_exports import MapExports
 from cairn_server.views.map_views import MapViews
+from cairn_server.views.retract_preview import RetractPreviews
 from cairn_server.views.value_spread import ValueSpread
 
 KEEP_FULL_AUTHORS_S = 300.0
@@ -109,6 +110,7 @@ class ViewParts:
     hottest: HottestSearch
     hot_spots: HotSpotSearch
     spread: ValueSpread
+    retracts: RetractPreviews
 
 
 class Service:
@@ -220,6 +222,7 @@ class Service:
             HottestSearch(self.store, self.cells),
             HotSpotSearch(self.store, self.cells, cache_share=self.settings.memory.cache_share),
             ValueSpread(self.store, self.cells),
+            RetractPreviews(self.store, self.cells),
         )
 
     def _folded(self, row: MapRow) -> None:

@@ -209,6 +209,7 @@ class MemorySnapshot:
             place_m=scans[-1]["t_map_rig"] if scans else None,
             via=kept.new.via,
             note=meta.get("note", ""),
+            pushed_s=kept.received_s,
         )
 
 

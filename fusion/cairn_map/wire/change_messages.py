@@ -50,3 +50,31 @@ class ChangesAnswer(_Model):
     """Either of the two next to a surface that was or is there: mostly a pose that is off by a voxel."""
     warmer: list[CellVoxels]
     colder: list[CellVoxels]
+
+
+class RetractChangeCounts(_Model):
+    """Counts of voxels by the way in which a retract would change them."""
+
+    gone: Annotated[int, Field(ge=0)]
+    appeared: Annotated[int, Field(ge=0)]
+    warmer: Annotated[int, Field(ge=0)]
+    colder: Annotated[int, Field(ge=0)]
+    otherwise: Annotated[int, Field(ge=0)]
+
+
+class RetractChanges(_Model):
+    """Answer to `POST /maps/{map}/main/changes`: the voxels that a retract would change, as views show them."""
+
+    cursor: CursorText
+    """State of the map of which this is true."""
+    commits: Annotated[int, Field(ge=0)]
+    """Count of the commits whose evidence would go."""
+    counts: RetractChangeCounts
+    gone: list[CellVoxels]
+    """Occupied now, and not without these commits."""
+    appeared: list[CellVoxels]
+    """Occupied without these commits, and not now."""
+    warmer: list[CellVoxels]
+    colder: list[CellVoxels]
+    otherwise: list[CellVoxels]
+    """Voxels of another probability or colour, or with a temperature in one of the two alone."""

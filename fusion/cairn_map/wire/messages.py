@@ -393,6 +393,9 @@ class LogEntry(_Model):
     """Name of the token of the relay that handed it over; None: its own robot did, or the server made it."""
     note: Annotated[str, Field(max_length=1024)] = ""
     """Note of its author; empty, too, once its evidence is not kept."""
+    pushed_s: Annotated[float | None, Field(exclude_if=lambda value: value is None)] = None
+    """Time at which this server received the commit, UTC seconds since 1970; None: the server is of before."""
+    pushed_utc: UtcText = None
 
     @property
     def names(self) -> int:

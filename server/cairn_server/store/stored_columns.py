@@ -74,6 +74,7 @@ def log_entry(
     place: str | None,
     note: str | None,
     via: str | None,
+    received_s: float,
 ) -> LogEntry:
     """A log entry from its columns; the place is JSON."""
     return LogEntry.model_validate(
@@ -91,6 +92,7 @@ def log_entry(
             "place_m": json.loads(place) if place else None,
             "via": via,
             "note": note or "",
+            "pushed_s": received_s,
         }
     )
 

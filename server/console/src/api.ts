@@ -77,10 +77,11 @@ export class Api {
     }
   }
 
-  /** What one cell looks like at an octree depth, if it is not what `etag` names. */
-  async view(map: string, cell: string, depth: number, etag: string | null): Promise<CellAnswer> {
+  /** What one cell looks like at an octree depth, or looked at a time, if it is not what `etag` names. */
+  async view(map: string, cell: string, depth: number, { etag, atS }: { etag: string | null; atS: number | null }): Promise<CellAnswer> {
     const headers: Record<string, string> = etag ? { "If-None-Match": etag } : {};
-    const answer = await this.ask(`maps/${map}/main/cells/${cell}.view?depth=${depth}`, { headers, cache: "no-store" });
+    const at = atS === null ? "" : `&at=${atS}`;
+    const answer = await this.ask(`maps/${map}/main/cells/${cell}.view?depth=${depth}${at}`, { headers, cache: "no-store" });
     const data = answer.status === 304 ? null : new Uint8Array(await answer.arrayBuffer());
     this.received += data?.length ?? 0;
     return { data, etag: answer.headers.get("ETag") ?? "" };

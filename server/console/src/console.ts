@@ -20,16 +20,16 @@ import { Spread } from "./scene/spread.ts";
 import { Stage } from "./scene/stage.ts";
 import { Walker } from "./scene/walker.ts";
 import { Team } from "./team.ts";
+import { TimeDesk } from "./time_desk.ts";
 import { CameraPanel } from "./ui/camera_panel.ts";
 import { Chips } from "./ui/chips.ts";
-import { CommitStrip, SHOWN } from "./ui/commit_strip.ts";
+import { SHOWN, type CommitStrip } from "./ui/commit_strip.ts";
 import { emptyMap } from "./ui/dead_ends.ts";
 import { openAsking, openFull } from "./ui/duty_dialogs.ts";
 import { DutyPanel } from "./ui/duty_panel.ts";
 import { LookPanel } from "./ui/look_panel.ts";
 import { mapFacts } from "./ui/map_facts.ts";
 import { MeasurePanel } from "./ui/measure_panel.ts";
-import { openCommit } from "./ui/retract_dialog.ts";
 import { ReferenceFrame } from "./ui/reference_frame.ts";
 import { TakeAwayPanel } from "./ui/take_away_panel.ts";
 import type { TopBar } from "./ui/top_bar.ts";
@@ -54,7 +54,7 @@ export class Console {
   readonly book: LogBook;
   readonly duties: Duties;
   readonly findings: FindingsDesk;
-  readonly strip = new CommitStrip();
+  readonly time: TimeDesk;
   readonly voxel: VoxelPanel;
   readonly measure: MeasurePanel;
   readonly camera: CameraPanel;
@@ -99,7 +99,7 @@ export class Console {
     const host = h("div", { class: "host" });
     this.book = new LogBook(api, info.name);
     this.duties = new Duties(api, info.name);
-    this.voxel = new VoxelPanel(api, info.name, (seq) => this.book.robotAt(seq));
+    this.voxel = new VoxelPanel(api, info.name, look, (seq) => this.book.robotAt(seq));
     this.takeAway = new TakeAwayPanel(api, info, look);
     this.panel = new LookPanel(look);
     this.measure = new MeasurePanel(info.geometry.voxel_edge_um / 1e6);
@@ -108,11 +108,18 @@ export class Console {
     const view = h("main", { class: "view" }, host, this.empty, this.labels, h("div", { class: "notes" }, this.flag, this.chips.element));
     const left = h("aside", { class: "left", "aria-label": "Team and map" });
     const right = h("aside", { class: "right", "aria-label": "Tools" }, this.panel.element, this.voxel.element, this.measure.element, this.takeAway.element);
-    this.element = h("div", { class: "console" }, left, view, right, h("footer", {}, this.strip.element, this.foot));
+    const footer = h("footer");
+    this.element = h("div", { class: "console" }, left, view, right, footer);
     document.body.append(this.element);
     this.stage = new Stage(host);
     this.cells = new Cells(api, info);
     this.cells.budget = this.stage.isSoftware ? SOFTWARE_BUDGET : 2_000_000;
+    this.time = new TimeDesk(api, info, look, { stage: this.stage, cells: this.cells }, this.book, {
+      say: (text) => this.say(text), isOperator: () => this.duties.isOperator, plan: () => this.plan(), fly: (to) => this.camera.go(to),
+    });
+    footer.append(this.strip.element);
+    this.strip.head.append(this.foot);
+    view.append(this.time.comparison.panel.element);
     this.spread = new Spread(api, info.name);
     this.heights = new Heights(look, this.cells, this.spread);
     this.team = new Team(api, info.name, this.labels, this.stage, this.cells);
@@ -152,6 +159,10 @@ export class Console {
     sample.geometry.dispose();
   }
 
+  get strip(): CommitStrip {
+    return this.time.strip;
+  }
+
   get name(): string {
     return this.info.name;
   }
@@ -160,6 +171,7 @@ export class Console {
   take(look: Look, camera: CameraView): void {
     Object.assign(this.look, look, { boxes: look.boxes ?? this.look.boxes });
     this.heights.forget();
+    this.time.follow();
     this.team.follow(null);
     this.stage.place(camera);
     this.camera.isPlaced = true;
@@ -177,6 +189,7 @@ export class Console {
     this.link.close();
     this.cells.dispose();
     this.findings.dispose();
+    this.time.dispose();
     this.picker.dispose();
     this.frame.dispose();
     this.appearance.dispose();
@@ -327,7 +340,6 @@ export class Console {
       else delete this.look.ranges[this.look.field];
       this.apply();
     };
-    this.strip.onChoose = (entry) => openCommit(this.api, this.info.name, entry, this.duties.isOperator);
     this.dutyPanel.onAsking = (asking) => openAsking(this.duties, asking);
     this.dutyPanel.onFull = (robot) => openFull(this.api, this.info.name, this.duties, robot);
     this.team.onFollow = () => this.stage.draw();
@@ -421,7 +433,8 @@ export class Console {
       this.appearance.refreshRange(this.team.names);
     }
     if (this.cursor) this.spread.tick(this.cells.head);
-    this.heights.tick();
+    // Of a past moment heights are told as of now: the picture stays comparable.
+    if (this.look.atS === null || !this.heights.storeys.floorsM.length) this.heights.tick();
     this.camera.settle();
     this.kept.tick(this.camera.isPlaced && !this.stage.isFlying);
     const bounds = this.cells.tightBounds;
@@ -438,12 +451,13 @@ export class Console {
     this.dutyPanel.show(this.duties);
     this.team.tick(this.look.field, this.cells.head, this.duties.full);
     this.strip.show(this.team.names);
+    this.time.tick();
     const { lastSeq } = this.team;
     const missed = lastSeq === null ? [] : [...this.cells.all.values()].filter(({ points, lm }) => points && lm > lastSeq);
     this.unseen.update(missed.map(({ box }) => box));
     this.empty.hidden = this.cursor === "" || this.cells.all.size > 0;
     this.labels.hidden = this.cells.firstPictureMs === null && this.cells.all.size > 0;
-    this.chips.show(this.look, this.cells, this.heights.storeys, this.panel.zeroM);
+    this.chips.show(this.look, this.cells, this.heights.storeys, this.panel.zeroM, this.time.words);
     const drawn = `${thousands(this.cells.drawn)} nodes of ${this.cells.all.size} cells`;
     this.foot.textContent = this.stage.isSoftware ? `${drawn} · drawn without a graphics card: coarser and slower` : drawn;
   }

@@ -31,6 +31,10 @@ export interface Look {
   band: [number, number | null] | null;
   cells: boolean;
   boxes: boolean | null;
+  /** Time of capture up to which the map is shown, UTC seconds; null: now. */
+  atS: number | null;
+  /** Time with which that is compared; null: nothing is compared. */
+  sinceS: number | null;
 }
 
 export interface CameraView {
@@ -41,7 +45,7 @@ export interface CameraView {
 export function defaultLook(): Look {
   return {
     field: "colour", ranges: {}, floorM: null, ceilingM: null, isCeilingChosen: false, clip: null, minP: 0, band: null,
-    cells: false, boxes: null,
+    cells: false, boxes: null, atS: null, sinceS: null,
   };
 }
 
@@ -58,6 +62,8 @@ export function toHash(map: string, look: Look, camera: CameraView | null): stri
   add("p", look.minP > 0 ? numbers([look.minP]) : null);
   add("band", look.band && `${numbers([look.band[0]])},${look.band[1] === null ? "" : numbers([look.band[1]])}`);
   add("cells", look.cells ? "1" : null);
+  add("at", look.atS === null ? null : String(look.atS));
+  add("since", look.sinceS === null ? null : String(look.sinceS));
   add("eye", camera && numbers(camera.eye));
   add("target", camera && numbers(camera.target));
   return "#" + parts.map(([name, value]) => `${name}=${value}`).join("&");
@@ -88,6 +94,8 @@ export function fromHash(hash: string): { map: string | null; look: Look; camera
   look.band = band && band[0] !== null ? (band as [number, number | null]) : null;
   look.cells = given.get("cells") === "1";
   look.boxes = given.has("boxes") ? given.get("boxes") === "1" : null;
+  look.atS = one("at");
+  look.sinceS = one("since");
   const eye = numbers("eye", 3) as Triple | null;
   const target = numbers("target", 3) as Triple | null;
   const map = given.get("map") ?? null;

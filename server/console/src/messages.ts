@@ -20,6 +20,8 @@ export interface MapInfo {
   commits: number;
   branches: number;
   box_m: [Triple, Triple] | null;
+  /** Left out: the map is one sum for all times. */
+  epoch_s?: number;
 }
 
 export interface CellEntry {
@@ -87,6 +89,10 @@ export interface LogEntry {
   retracts: string[];
   place_m: Triple | null;
   via: string | null;
+  /** Of its author. */
+  note?: string;
+  /** When the server received it. */
+  pushed_s?: number;
 }
 
 export interface RetractRequest {

@@ -34,6 +34,20 @@ export function clock(timeS: number): string {
   return new Date(timeS * 1000).toISOString().replace("T", " ").slice(0, 19) + " UTC";
 }
 
+/** The time of day, with the day where the day begins. */
+export function clockTime(timeS: number): string {
+  const text = new Date(timeS * 1000).toISOString();
+  return text.slice(11, 19) === "00:00:00" ? text.slice(0, 10) : text.slice(11, 19).replace(/:00$/, "");
+}
+
+/** How long, in one unit. */
+export function duration(seconds: number): string {
+  for (const [unit, size] of [["d", 86400], ["h", 3600], ["min", 60]] as const) {
+    if (seconds >= 2 * size) return `${Math.round(seconds / size)} ${unit}`;
+  }
+  return `${Math.round(seconds)} s`;
+}
+
 export function thousands(count: number): string {
   return Math.round(count).toLocaleString("en-GB").replaceAll(",", "\u202f");
 }

@@ -3,6 +3,7 @@
 import io
 import json
 import re
+import time
 
 import numpy as np
 import pytest
@@ -178,3 +179,5 @@ def test_log_entries_tell_their_parent_and_what_their_author_had_seen(live: Live
     entries = live.http.get(f"/maps/{made.name}/log").json()
     assert [(entry["parent"], entry["seen"]) for entry in entries][:2] == [(None, None), (first.sha.hex(), seen)]
     assert [entry["place_m"] for entry in entries] == [[0.0, 0.0, 0.4]] * len(entries)
+    assert all(abs(entry["pushed_s"] - time.time()) < 600 for entry in entries), "when the server received each"
+    assert all(entry["pushed_utc"].endswith("Z") for entry in entries)

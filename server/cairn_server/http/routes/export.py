@@ -12,13 +12,15 @@ from cairn_map.errors import DeniedError
 from cairn_map.files.export_request import BOX_CHARS_MAX, EXPORT_TYPES, ExportRequest, ExportTicket, TicketedExport
 from cairn_map.queries.hot_spots import VOXELS_MIN, WARM_K
 from cairn_map.render.render_request import RenderRequest
-from cairn_map.wire.change_messages import ChangesAnswer
+from cairn_map.wire.change_messages import ChangesAnswer, RetractChanges
 from cairn_map.wire.hot_spot_messages import SPOTS_MAX, VOXELS_MAX, HotSpotsAnswer
 from cairn_map.wire.hottest_messages import HOTTEST_MAX, HottestAnswer
+from cairn_map.wire.messages import Retract
 from cairn_map.wire.spread_messages import SpreadAnswer
+from cairn_server.access.auth import Role
 from cairn_server.access.connection_places import ConnectionPlace
 from cairn_server.http.middleware.deadlines import PLACE
-from cairn_server.http.routes.callers import READERS, Asking, Credentials, Map, Operations
+from cairn_server.http.routes.callers import READERS, Asking, Credentials, Map, Operations, allowed
 from cairn_server.http.routes.documentation import answers, json_body, problems
 from cairn_server.http.routes.json_bodies import json_of
 from cairn_server.store.store_rows import MapRow
@@ -88,6 +90,17 @@ def changes(
 ) -> ChangesAnswer:
     """Voxels that appeared, went, moved by a voxel, or became warmer or colder after a time, by capture."""
     return service.views.changes.asked(row, since, until, box)
+
+
+@router.post(
+    "/maps/{name}/main/changes",
+    dependencies=[Depends(allowed(Role.OPERATOR))],
+    responses=problems(409, 413),
+    openapi_extra=json_body(Retract, example={"commits": ["mole.1f2e3d4c5b6a7988.12"]}),
+)
+def changes_of_retract(service: Operations, row: Map, body: Annotated[Retract, json_of(Retract)]) -> RetractChanges:
+    """Voxels that would look otherwise if these commits were taken out; nothing is."""
+    return service.views.retracts.asked(row, body)
 
 
 @router.get("/maps/{name}/main/hottest", dependencies=READERS)

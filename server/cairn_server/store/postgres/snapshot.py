@@ -48,7 +48,8 @@ from cairn_server.store.tiles import Box, is_in_box
 
 OF_COMMIT = "map = %s AND robot = %s AND incarnation = %s AND n = %s"
 LOG_COLUMNS = (
-    "seq, kind, robot, incarnation, n, sha, size_bytes, cells, captured_first_s, captured_last_s, retracts, meta, via"
+    "seq, kind, robot, incarnation, n, sha, size_bytes, cells, captured_first_s, captured_last_s, retracts, meta, via,"
+    " received_s"
 )
 HELD_CELLS, HELD_BYTES_MAX = 16, 1 << 20
 """Most cells that are read at once, and the size from which on a cell is not among them."""
@@ -320,7 +321,7 @@ class PgSnapshot:
             " WHERE log.map = %s AND seq > %s ORDER BY seq LIMIT %s"
         )
         found = rows(self._connection, query, (self._map, after_seq, limit))
-        columns = ([*facts, *_said(meta), via] for *facts, meta, via in found)
+        columns = ([*facts, *_said(meta), via, received_s] for *facts, meta, via, received_s in found)
         return [log_entry(*each) for each in columns]
 
     def chained(self, *, after_seq: int, limit: int) -> list[ChainedEntry]:

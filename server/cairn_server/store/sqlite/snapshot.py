@@ -47,7 +47,7 @@ PARENT, SEEN, PLACE, NOTE = (
 """SQL of four fields of a commit's meta; NULL, too, if the meta is damaged."""
 LOG_COLUMNS = (
     "seq, kind, robot, incarnation, n, sha, size_bytes, cells, captured_first_s, captured_last_s, retracts,"
-    f" {PARENT}, {SEEN}, {PLACE}, {NOTE}, via"
+    f" {PARENT}, {SEEN}, {PLACE}, {NOTE}, via, received_s"
 )
 
 

@@ -3,9 +3,11 @@
 import { Box3, Group, type Camera, type PerspectiveCamera, type Points, type ShaderMaterial } from "three";
 import { ApiError, NONE_READY, type Api, type CellAnswer, type ReadyViews } from "../api.ts";
 import type { CellEntry, MapInfo, Triple } from "../messages.ts";
+import type { Moment } from "../timeline.ts";
 import { Decoders } from "./decoders.ts";
 import { COARSE, plan } from "./detail.ts";
 import { squares, uniforms } from "./materials.ts";
+import { PastViews } from "./past_views.ts";
 import { NEVER_MS, samplePoints, ShownCell } from "./shown_cell.ts";
 
 /** Browsers open six connections to a server over plain http; one stays for what is clicked. */
@@ -41,6 +43,11 @@ export class Cells {
   private readonly map: string;
   private planned = false;
   private ready = NONE_READY;
+  /** Moment that is shown, or on its way; null: now. */
+  private moment: Moment | null = null;
+  private readonly past = new PastViews();
+  /** Why some cells are not known at the moment that is shown: the server's words. */
+  unknown: string | null = null;
 
   constructor(api: Api, info: MapInfo) {
     this.api = api;
@@ -53,6 +60,8 @@ export class Cells {
   takeIndex(entries: readonly CellEntry[], ready: ReadyViews): void {
     this.ready = ready;
     const there = new Set<string>();
+    // Entries of another log may have the same numbers.
+    this.past.forget();
     for (const { cell, digest, lm, voxels } of entries) {
       this.head = Math.max(this.head, lm);
       if (!voxels) continue;
@@ -84,6 +93,38 @@ export class Cells {
     shown.dirty = true;
     this.head = Math.max(this.head, lm);
     this.planned = false;
+  }
+
+  /** Show the map as it was at a moment; null: as it is. What was shown before is kept, so the way back is short. */
+  showMoment(moment: Moment | null): void {
+    if (moment?.key === this.moment?.key) return;
+    if (!this.moment) for (const cell of this.all.values()) if (!cell.dirty && cell.etag !== null) this.past.put(...this.nameOf(cell, cell.depth), cell.bytes);
+    this.moment = moment;
+    this.unknown = null;
+    for (const cell of this.all.values()) {
+      const depth = cell.depth || cell.wanted;
+      const bytes = this.past.get(...this.nameOf(cell, depth));
+      cell.failedMs = NEVER_MS;
+      cell.isUnknown = false;
+      cell.dirty = !bytes;
+      if (!bytes) continue;
+      cell.momentKey = this.momentKey;
+      cell.etag = "";
+      if (bytes === cell.bytes) continue;
+      this.show(cell, bytes, depth);
+      cell.counted(depth);
+    }
+    this.planned = false;
+    this.onChange(true);
+  }
+
+  private get momentKey(): string {
+    return this.moment?.key ?? "";
+  }
+
+  /** Of what a cell is at a depth and at the moment that is shown. */
+  private nameOf(cell: ShownCell, depth: number): [string, string] {
+    return [`${cell.key}/${depth}`, `${cell.lm}/${this.momentKey}`];
   }
 
   get drawn(): number {
@@ -174,17 +215,26 @@ export class Cells {
     cell.dirty = false;
     // The first picture is coarse, whatever will be wanted.
     const depth = cell.etag === null ? Math.min(cell.wanted, Math.max(this.depthMax - COARSE, 1)) : cell.wanted;
+    const { moment } = this;
+    const name = this.nameOf(cell, depth);
     try {
-      const changes = depth === cell.depth;
-      const ready = cell.etag === null ? this.takeReady(cell, depth) : null;
-      const { data, etag } = ready ?? (await this.api.view(this.map, cell.key, depth, changes ? cell.etag : null));
+      const changes = depth === cell.depth && cell.momentKey === this.momentKey;
+      const ready = cell.etag === null && !moment ? this.takeReady(cell, depth) : null;
+      const { data, etag } = ready ?? (await this.api.view(this.map, cell.key, depth, { etag: changes ? cell.etag || null : null, atS: moment?.atS ?? null }));
       if (data) {
-        const bytes = await this.decoders.decode(data);
+        const decoded = await this.decoders.decode(data);
+        const bytes = moment ? this.past.put(...name, decoded) : decoded;
+        if (moment !== this.moment) {
+          cell.dirty = true; // another moment is shown by now
+          return;
+        }
         if (this.all.get(cell.key) === cell) {
           if (changes && cell.etag) cell.freshMs = performance.now() + FRESH_MS;
           this.show(cell, bytes, depth);
         }
       }
+      cell.momentKey = moment?.key ?? "";
+      cell.isUnknown = false;
       cell.etag = etag;
       cell.counted(depth);
       cell.failedMs = NEVER_MS;
@@ -194,7 +244,8 @@ export class Cells {
         isWhole = true;
       }
     } catch (error) {
-      this.failed(cell, error);
+      if (moment === this.moment) this.failed(cell, error);
+      else cell.dirty = true;
     } finally {
       this.running--;
       cell.busy = false;
@@ -219,7 +270,25 @@ export class Cells {
     window.setTimeout(() => this.onChange(false), RETRY_MS);
     if (error instanceof ApiError && error.wantsToken) this.onRefused();
     else if (error instanceof ApiError && error.kind === "no_cell") this.remove(cell);
+    else if (this.moment && error instanceof ApiError && (error.kind === "not_known" || error.kind === "too_costly")) this.lacks(cell, error.message);
     else this.error = `cell ${cell.key}: ${error instanceof Error ? error.message : String(error)}`;
+  }
+
+  /** Of this cell the moment that is shown is not known: it is not drawn, and not asked for again. */
+  private lacks(cell: ShownCell, why: string): void {
+    cell.drop();
+    cell.dirty = false;
+    cell.isUnknown = true;
+    cell.etag = "";
+    cell.momentKey = this.momentKey;
+    this.unknown = why;
+  }
+
+  /** Cells of which the moment that is shown is not known. */
+  get lacking(): number {
+    let sum = 0;
+    for (const { isUnknown } of this.all.values()) if (isUnknown) sum++;
+    return sum;
   }
 
   /** One voxel that nobody sees: what the graphics card is made ready with. */

@@ -28,6 +28,10 @@ export class ShownCell {
   dirty = true;
   busy = false;
   failedMs = NEVER_MS;
+  /** Moment that is shown; empty: now. */
+  momentKey = "";
+  /** What it held at that moment is not known any more. */
+  isUnknown = false;
   /** Until when it pulses, because it changed. */
   freshMs = 0;
   readonly number: number;
@@ -58,7 +62,7 @@ export class ShownCell {
 
   /** What is shown is coarser or finer than wanted. */
   get isOff(): boolean {
-    return this.depth !== this.wanted && !this.isEmpty;
+    return this.depth !== this.wanted && !this.isEmpty && !this.isUnknown;
   }
 
   /** What is shown is all that its depth has; where that changed, other depths are guessed to have changed alike. */

@@ -12,15 +12,17 @@ export class Chips {
   onCeiling: () => void = () => {};
   private readonly ceiling: HTMLButtonElement;
   private readonly loading = h("span", { class: "chip", role: "status", hidden: true });
+  private readonly past = h("span", { class: "chip late", role: "status", hidden: true });
   private readonly leftOut = h("span", { class: "chip late", role: "status", hidden: true });
 
   constructor() {
     this.ceiling = h("button", { type: "button", class: "chip", title: "Ceiling off or on (C)", hidden: true, onclick: () => this.onCeiling() });
-    this.element = h("div", { class: "chips" }, this.ceiling, this.loading, this.leftOut);
+    this.element = h("div", { class: "chips" }, this.past, this.ceiling, this.loading, this.leftOut);
   }
 
-  /** Heights are told over `zeroM`. */
-  show(look: Look, cells: Cells, { isRoofed }: Storeys, zeroM: number): void {
+  /** Heights are told over `zeroM`; `past`: that the map is not shown as it is. */
+  show(look: Look, cells: Cells, { isRoofed }: Storeys, zeroM: number, past: string): void {
+    say(this.past, past);
     say(this.ceiling, look.ceilingM !== null ? `Ceiling off above ${metres(look.ceilingM - zeroM, 1)}: show it` : isRoofed ? "Ceiling on: cut it off" : "");
     const all = cells.all.size;
     const here = [...cells.all.values()].filter(({ etag }) => etag !== null).length;

@@ -4,11 +4,25 @@ import type { Api } from "../api.ts";
 import { facts, fill, h } from "../dom.ts";
 import { robotOf } from "../log_book.ts";
 import type { LogEntry, Retracted, RetractRequest } from "../messages.ts";
-import { bytes, clock } from "../units.ts";
+import type { TakenOut } from "../timeline.ts";
+import { bytes, clock, counted } from "../units.ts";
 
-/** Open on one commit; closes when it is done or given up. Who may not retract only looks. */
-export function openCommit(api: Api, map: string, entry: LogEntry, mayRetract: boolean): void {
+const OPERATOR = "operator";
+
+/** Who looks, and what is known of the commit. */
+export interface Looking {
+  readonly mayRetract: boolean;
+  /** When, by whom and why it was taken out; null: it is in the map. */
+  readonly out: TakenOut | null;
+  /** Show in the map what a retract would change, in words, too; null: nothing any more. */
+  preview(body: RetractRequest | null): Promise<string>;
+}
+
+/** Open on one commit; closes when it is done or given up. Who may not retract only looks, and nothing is taken out twice. */
+export function openCommit(api: Api, map: string, entry: LogEntry, { mayRetract, out, preview: inMap }: Looking): void {
   const robot = robotOf(entry.id);
+  const isRetract = entry.cells === 0 && entry.retracts.length > 0;
+  const may = mayRetract && !out && entry.kind === "+" && robot !== OPERATOR;
   const [, last] = entry.captured_s ?? [0, 0];
   const what = h(
     "select", { id: "what" },
@@ -21,25 +35,29 @@ export function openCommit(api: Api, map: string, entry: LogEntry, mayRetract: b
   const preview = h("button", { type: "button" }, "Show what that takes out");
   const confirm = h("button", { type: "button", class: "danger", disabled: true }, "Take out for good");
   const close = h("button", { type: "button" }, "Close");
+  const asks = [h("label", { for: "what" }, "What"), what, h("label", { for: "note" }, "Note"), note];
   const dialog = h(
     "dialog", { class: "retract", "aria-label": `Commit ${entry.id}` },
-    h("h2", {}, "Commit of ", robot),
+    h("h2", {}, isRetract ? "Retract by " : "Commit of ", robot),
+    out && outFacts(out),
     facts([
       ["id", h("code", {}, entry.id)],
       ["log entry", String(entry.seq)],
       ["seen", entry.captured_s ? clock(last) : "unknown"],
-      ["size", `${bytes(entry.size_bytes)} in ${entry.cells} cells`],
-      ["came by", entry.via ?? "its robot"],
+      ["came", entry.pushed_s ? clock(entry.pushed_s) : "unknown"],
+      ["size", `${bytes(entry.size_bytes)} in ${counted(entry.cells, "cell", "cells")}`],
+      ["came by", entry.via ?? (robot === OPERATOR ? "an operator" : "its robot")],
+      ...(entry.note ? [["note", entry.note] as [string, string]] : []),
     ]),
-    ...(mayRetract
+    ...(isRetract ? [h("h3", {}, "It takes out"), listOf(entry.retracts)] : []),
+    ...(may
       ? [
           h("h3", {}, "Take out of the map"),
           h("p", { class: "hint" }, "The map is then as if it had never been pushed, here and on every robot. It cannot be undone."),
-          h("label", { for: "what" }, "What"), what,
-          h("label", { for: "note" }, "Note"), note, said,
+          ...asks, said,
         ]
       : []),
-    h("div", { class: "buttons" }, ...(mayRetract ? [preview, confirm] : []), close),
+    h("div", { class: "buttons" }, ...(may ? [preview, confirm] : []), close),
   );
   const request = (): RetractRequest => ({
     ...(what.value === "one" ? { commits: [entry.id] } : { robot }),
@@ -58,25 +76,63 @@ export function openCommit(api: Api, map: string, entry: LogEntry, mayRetract: b
   };
   // What is confirmed is what was shown, whatever was pushed meanwhile.
   let shown: string[] = [];
-  what.addEventListener("change", () => {
+  const forget = () => {
     confirm.disabled = true;
     fill(said);
-  });
+    void inMap(null);
+  };
+  what.addEventListener("change", forget);
   preview.addEventListener("click", async () => {
     const found = await send(request());
     if (!found) return;
     shown = found.commits;
     confirm.disabled = false;
     confirm.textContent = `Take ${found.commits.length} out for good`;
-    fill(said, h("p", {}, `${found.commits.length} commit${found.commits.length === 1 ? "" : "s"}:`), h("ul", {}, ...found.commits.map((id) => h("li", {}, h("code", {}, id)))));
+    const changes = h("p", { role: "status" }, "Looking what it changes …");
+    fill(said, h("p", {}, `${counted(found.commits.length, "commit", "commits")}:`), listOf(found.commits), changes);
+    stepAside(dialog);
+    changes.textContent = await inMap({ commits: shown, preview: true }).catch((error: Error) => error.message);
   });
   confirm.addEventListener("click", async () => {
     confirm.disabled = preview.disabled = true;
     const done = await send({ commits: shown, note: note.value, preview: false });
-    if (done) fill(said, h("p", { class: "done" }, `Done: ${done.commits.length} taken out by ${done.id ?? ""}. The map follows in a moment.`));
+    preview.disabled = false;
+    void inMap(null);
+    if (!done) return;
+    for (const part of [...asks, preview, confirm]) part.remove();
+    fill(said, h("p", { class: "done" }, `Done: ${done.commits.length} taken out by ${done.id ?? ""}. The map follows in a moment.`));
   });
   close.addEventListener("click", () => dialog.close());
-  dialog.addEventListener("close", () => dialog.remove());
+  const escape = (event: KeyboardEvent) => event.key === "Escape" && dialog.close();
+  document.addEventListener("keydown", escape);
+  dialog.addEventListener("close", () => {
+    if (dialog.open) return; // it stepped aside
+    document.removeEventListener("keydown", escape);
+    dialog.remove();
+    if (may) void inMap(null);
+  });
   document.body.append(dialog);
   dialog.showModal();
+}
+
+/** What an operator must know first: that it is out already, and why. */
+function outFacts({ whenS, by, note }: TakenOut): HTMLElement {
+  return h(
+    "div", { class: "out" }, h("strong", {}, "Taken out of the map"),
+    facts([["when", whenS === null ? "unknown" : clock(whenS)], ["by", by === null ? "unknown" : h("span", {}, robotOf(by), " in ", h("code", {}, by))], ["why", note || "no note"]]),
+  );
+}
+
+function listOf(ids: readonly string[]): HTMLElement {
+  return h("ul", {}, ...ids.map((id) => h("li", {}, h("code", {}, id))));
+}
+
+/** Let the map be seen, and turned, while it shows what would go. */
+function stepAside(dialog: HTMLDialogElement): void {
+  if (dialog.classList.contains("aside")) return;
+  const focused = document.activeElement as HTMLElement | null;
+  dialog.classList.add("aside");
+  dialog.close();
+  dialog.show();
+  focused?.focus();
 }

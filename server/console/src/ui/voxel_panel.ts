@@ -2,6 +2,7 @@
 
 import type { Api } from "../api.ts";
 import { facts, fill, h } from "../dom.ts";
+import type { Look } from "../look.ts";
 import type { Channel, Triple } from "../messages.ts";
 import { readingOf, type Picked } from "../scene/picking.ts";
 import { serverNowS } from "../server_time.ts";
@@ -41,13 +42,15 @@ export class VoxelPanel {
   readonly element = h("section", { "aria-label": "Voxel", "aria-live": "polite" });
   private readonly api: Api;
   private readonly map: string;
+  private readonly look: Look;
   /** Whose commit a log entry folded; null: not known here. */
   private readonly robotAt: (seq: number) => string | null;
   private asked = 0;
 
-  constructor(api: Api, map: string, robotAt: (seq: number) => string | null) {
+  constructor(api: Api, map: string, look: Look, robotAt: (seq: number) => string | null) {
     this.api = api;
     this.map = map;
+    this.look = look;
     this.robotAt = robotAt;
     this.clear();
   }
@@ -68,7 +71,8 @@ export class VoxelPanel {
     const voxel = picked.node.map((place, axis) => place + picked.cell.cell[axis] * side) as Triple;
     fill(this.element, h("h2", {}, "Voxel"), coarse(picked, floorM), h("p", { class: "hint" }, "Asking the server …"));
     try {
-      const answer = await this.api.json<VoxelAnswer>(`maps/${this.map}/main/voxels/${voxel.join(",")}`);
+      const { atS } = this.look;
+      const answer = await this.api.json<VoxelAnswer>(`maps/${this.map}/main/voxels/${voxel.join(",")}${atS === null ? "" : `?time=${atS}`}`);
       if (mine === this.asked) fill(this.element, h("h2", {}, "Voxel"), reading(answer, floorM), exact(answer), whence(answer, this.robotAt(answer.lm)));
     } catch (error) {
       if (mine === this.asked) fill(this.element, h("h2", {}, "Voxel"), coarse(picked, floorM), h("p", { class: "error" }, (error as Error).message));

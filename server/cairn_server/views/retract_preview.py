@@ -1,0 +1,156 @@
+"""Preview of a retract in a map: each voxel that would be shown otherwise, before anything is taken out.
+
+    cell as it is          -->  its view
+    cell less the commits  -->  its view      gone, appeared, warmer, colder, otherwise: exactly what differs
+
+Views are compared, not counts: a voxel of which hits go and which looks the same is no change to who looks.
+"""
+
+import time
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+
+from cairn_map.arrays import Ints
+from cairn_map.commits.cursor import ENTRY_FOLD
+from cairn_map.commits.ids import CommitId
+from cairn_map.epochs.cell_history import CellHistory, unmerged
+from cairn_map.epochs.present import shown_evidence
+from cairn_map.errors import BadInputError, ConflictError
+from cairn_map.evidence.grid import CellKey, cell_of_key, centres_of_voxels
+from cairn_map.evidence.view import View, ViewStyle, view_of
+from cairn_map.kernels.morton_kernels import deinterleave
+from cairn_map.wire.change_messages import CellVoxels, RetractChangeCounts, RetractChanges
+from cairn_map.wire.messages import Retract
+from cairn_server.access.cancellation import CANCELLATION
+from cairn_server.cell_room import DECODING
+from cairn_server.folding.cells import CellFaults, Cells
+from cairn_server.folding.cells_at_rest import sound_cell, stored_history, sum_of_contributions
+from cairn_server.store.store import Snapshot, Store
+from cairn_server.store.store_rows import Contribution, MapRow
+from cairn_server.sync.retracting import targets_of
+from cairn_server.views.map_changes import CHANGED_MAX, SEARCH_S
+from cairn_server.views.readings import fits
+
+WAYS = ("gone", "appeared", "warmer", "colder", "otherwise")
+NO_HEAT = np.iinfo(np.int64).min
+"""Temperature of a node that has none."""
+
+
+class RetractPreviews:
+    """Previews of retracts in the maps of a store; thread-safe."""
+
+    def __init__(self, store: Store, cells: Cells) -> None:
+        self._store = store
+        self._cells = cells
+
+    def asked(self, row: MapRow, request: Retract) -> RetractChanges:
+        """Voxels that would look otherwise if a retract were folded now.
+
+        Commits that are not folded, or are out already, change nothing.
+
+        Raises:
+            NotFoundError: kind `nothing_to_retract`.
+            BadInputError: kind `not_retractable`; `too_large`: too many voxels change; `too_costly`: it takes too long.
+            ConflictError: kind `evidence_gone`: evidence of a commit is not kept.
+            DamagedCellError: kind `damaged_store`: a cell is damaged.
+        """
+        end_s = time.monotonic() + SEARCH_S
+        with self._cells.reading(row) as faults, self._store.snapshot(row) as snapshot:
+            commits = _in_map(snapshot, targets_of(request, snapshot))
+            found: dict[str, list[CellVoxels]] = {way: [] for way in WAYS}
+            counts: dict[str, int] = dict.fromkeys(WAYS, 0)
+            for key in sorted(snapshot.touched_cells(commits)):
+                CANCELLATION.get().check()
+                if time.monotonic() > end_s:
+                    raise BadInputError("too_costly", f"comparing takes more than {SEARCH_S:g} s; name fewer commits")
+                for way, voxels in _changes_of(snapshot, key, row, commits, faults).items():
+                    counts[way] += len(voxels)
+                    if len(voxels):
+                        found[way].append(_cell_voxels(key, voxels, row))
+                if sum(counts.values()) > CHANGED_MAX:
+                    raise BadInputError("too_large", f"more than {CHANGED_MAX} voxels change; name fewer commits")
+            return RetractChanges(
+                cursor=str(snapshot.head),
+                commits=len(commits),
+                counts=RetractChangeCounts.model_validate(counts),
+                **found,
+            )
+
+
+def _in_map(snapshot: Snapshot, targets: list[CommitId]) -> frozenset[CommitId]:
+    """Those of the commits whose evidence is in the map."""
+    named = [each for each in snapshot.named(targets) if each.is_folded and not each.is_retracted]
+    gone = [str(each.id) for each in named if each.is_gone]
+    if gone:
+        raise ConflictError("evidence_gone", f"the evidence of {gone[0]} is not kept; who has it pushes it again first")
+    return frozenset(each.id for each in named)
+
+
+def _changes_of(
+    snapshot: Snapshot, key: CellKey, row: MapRow, commits: frozenset[CommitId], faults: CellFaults
+) -> Mapping[str, Ints]:
+    """Morton numbers of a cell's voxels that would be shown otherwise, by the way in which."""
+    stored = sound_cell(snapshot, key, row.layer, faults.healed)
+    if stored is None:
+        return {}
+    if not fits(row, stored.voxels):
+        raise BadInputError("too_costly", f"cell {','.join(map(str, cell_of_key(key)))} is too large to be compared")
+    with DECODING.of_cell(row.geometry, stored.voxels):
+        whole = stored_history(stored, row.layer)
+        entries = _entries_of(snapshot, key, commits)
+        part = sum_of_contributions(snapshot, key, entries, row.layer).history()
+        return _differences(_view(whole, row), _view(unmerged(whole, part, row.geometry), row))
+
+
+def _entries_of(snapshot: Snapshot, key: CellKey, commits: frozenset[CommitId]) -> Iterable[Contribution]:
+    """Entries of these commits that are in a cell."""
+    entries = [each for each in snapshot.contributions(key, after_seq=0) if each.commit in commits]
+    # A commit is folded again only after it was taken out, so what is in the cell is its last entry.
+    last = {each.commit: each for each in entries}
+    return [each for each in last.values() if each.kind == ENTRY_FOLD]
+
+
+def _view(history: CellHistory, row: MapRow) -> View:
+    evidence = shown_evidence(history, row.layer, row.sensor_model)
+    return view_of(evidence, row.geometry, row.sensor_model, ViewStyle(depth=row.geometry.depth))
+
+
+def _differences(now: View, then: View) -> dict[str, Ints]:
+    """Nodes that are in one of two views alone, or look different in them."""
+    mine, theirs = now.nodes.astype(np.int64), then.nodes.astype(np.int64)
+    both, rows, other_rows = np.intersect1d(mine, theirs, assume_unique=True, return_indices=True)
+    before, after = _heats(now)[rows], _heats(then)[other_rows]
+    has_both = (before != NO_HEAT) & (after != NO_HEAT)
+    warmer, colder = has_both & (after > before), has_both & (after < before)
+    is_other = (_looks(now)[rows] != _looks(then)[other_rows]).any(axis=1) | (before != after)
+    return {
+        "gone": np.setdiff1d(mine, theirs, assume_unique=True),
+        "appeared": np.setdiff1d(theirs, mine, assume_unique=True),
+        "warmer": both[warmer],
+        "colder": both[colder],
+        "otherwise": both[is_other & ~warmer & ~colder],
+    }
+
+
+def _heats(view: View) -> Ints:
+    """(V,) mean temperatures of a view's nodes, in its steps; `NO_HEAT`: none."""
+    heats = np.full(len(view), NO_HEAT, np.int64)
+    if len(view.warm):
+        heats[view.warm] = view.temperatures.reshape(len(view.warm), -1)[:, 0]
+    return heats
+
+
+def _looks(view: View) -> Ints:
+    """(V, 4) probabilities and colours of a view's nodes; -1: no colour."""
+    looks = np.full((len(view), 4), -1, np.int64)
+    looks[:, 0] = view.chances
+    if len(view.coloured):
+        looks[view.coloured, 1:] = view.rgb
+    return looks
+
+
+def _cell_voxels(key: CellKey, nodes: Ints, row: MapRow) -> CellVoxels:
+    voxels = deinterleave(nodes.astype(np.uint64)) + np.array(cell_of_key(key)) * row.geometry.side
+    centres_m = np.round(centres_of_voxels(voxels, row.geometry), 6)
+    return CellVoxels(cell=cell_of_key(key), centres_m=[(x, y, z) for x, y, z in centres_m.tolist()])

@@ -1,0 +1,112 @@
+/** Two moments compared: what the server says is new, gone, warmer or colder, as colours in the map and as a list. */
+
+import { Vector3 } from "three";
+import { ApiError, type Api } from "./api.ts";
+import { centresOf, thingsOf, WAYS, type ChangedThing, type Changes, type Way } from "./changes.ts";
+import type { Look } from "./look.ts";
+import type { MapInfo } from "./messages.ts";
+import type { Cells } from "./scene/cells.ts";
+import { ChangedVoxels } from "./scene/changed_voxels.ts";
+import type { Stage } from "./scene/stage.ts";
+import { isShown, visibleFrom } from "./scene/viewpoint.ts";
+import { ChangesPanel, COLOURS } from "./ui/time/changes_panel.ts";
+
+/** Handles rest so long before the server is asked: it looks through every cell that has news. */
+const REST_MS = 300;
+const AGAIN_MS = 3000;
+
+export class Comparison {
+  readonly panel = new ChangesPanel();
+  readonly voxels: ChangedVoxels;
+  things: readonly ChangedThing[] = [];
+  onFly: (to: ReturnType<typeof visibleFrom>) => void = () => {};
+  private changes: Changes | null = null;
+  private readonly hidden = new Set<Way>(["moved"]);
+  /** What was asked, or is to be; empty: nothing is compared. */
+  private asked = "";
+  private timer = 0;
+  private drawn = "";
+  private readonly api: Api;
+  private readonly info: MapInfo;
+  private readonly look: Look;
+  private readonly stage: Stage;
+  private readonly cells: Cells;
+
+  constructor(api: Api, info: MapInfo, look: Look, stage: Stage, cells: Cells) {
+    this.api = api;
+    this.info = info;
+    this.look = look;
+    this.stage = stage;
+    this.cells = cells;
+    this.voxels = new ChangedVoxels(info.geometry.voxel_edge_um / 1e6);
+    this.stage.add(this.voxels.group);
+    this.panel.onFly = (thing) => this.onFly(visibleFrom(this.cells, placeToSee(thing), this.stage.camera.position));
+    this.panel.onWay = (way) => {
+      if (!this.hidden.delete(way)) this.hidden.add(way);
+      this.draw();
+    };
+  }
+
+  /** A few times a second: compare what the look says, and again when the map changed. */
+  tick(): void {
+    const { sinceS, atS } = this.look;
+    const asked = sinceS === null ? "" : JSON.stringify([sinceS, atS, this.cells.head]);
+    if (asked !== this.asked) {
+      this.asked = asked;
+      window.clearTimeout(this.timer);
+      if (asked) {
+        this.panel.say("Comparing …");
+        this.timer = window.setTimeout(() => void this.ask(asked), REST_MS);
+      } else {
+        this.changes = null;
+        this.things = [];
+        this.panel.close();
+      }
+    }
+    this.draw();
+  }
+
+  dispose(): void {
+    window.clearTimeout(this.timer);
+    this.asked = "";
+    this.voxels.dispose();
+  }
+
+  private async ask(asked: string): Promise<void> {
+    const { sinceS, atS } = this.look;
+    const until = atS === null ? "" : `&until=${atS}`;
+    try {
+      const changes = await this.api.json<Changes>(`maps/${this.info.name}/main/changes?since=${sinceS}${until}`);
+      if (asked !== this.asked) return;
+      this.changes = changes;
+      this.things = thingsOf(changes, this.info.geometry.voxel_edge_um / 1e6);
+      this.draw();
+    } catch (error) {
+      if (asked !== this.asked) return;
+      this.changes = null;
+      this.things = [];
+      this.panel.say((error as Error).message);
+      if (error instanceof ApiError && error.kind === "busy") this.timer = window.setTimeout(() => void this.ask(asked), AGAIN_MS);
+    }
+  }
+
+  /** Again only where something is different. */
+  private draw(): void {
+    const { changes, look } = this;
+    const state = changes ? JSON.stringify([changes.cursor, changes.since_s, changes.until_s, [...this.hidden], look.floorM, look.ceilingM, look.clip]) : "";
+    if (state === this.drawn) return;
+    this.drawn = state;
+    if (!changes) this.voxels.clear();
+    else {
+      const parts = WAYS.filter((way) => !this.hidden.has(way));
+      this.voxels.show(parts.map((way) => ({ colour: COLOURS[way], centresM: centresOf(changes, way), isThere: way !== "gone" })), isShown);
+      this.panel.show(changes, this.things, this.hidden);
+    }
+    this.stage.draw();
+  }
+}
+
+/** Where nothing is any more one looks into the middle; of what is there one sees the top. */
+function placeToSee({ way, placeM, highM }: ChangedThing): Vector3 {
+  return new Vector3(placeM[0], placeM[1], way === "gone" ? placeM[2] : highM[2]);
+}

@@ -1,0 +1,92 @@
+"""`POST .../main/changes`: the voxels that a retract would change are exactly those that it changes."""
+
+import numpy as np
+import pytest
+from tests.fixtures.map.made import SMALL
+from tests.fixtures.server.epoch_pushes import pushed_in
+from tests.fixtures.server.live import Live
+from tests.fixtures.server.pushes import MOLE, WREN, pushed
+
+from cairn_map.codec.view_code import decode_view
+from cairn_map.commits.commit import Commit
+from cairn_map.epochs.epoch import Epoch
+from cairn_map.epochs.layer import MapLayer
+from cairn_map.evidence.grid import centres_of_voxels
+from cairn_map.kernels.morton_kernels import deinterleave
+from cairn_map.wire.change_messages import CellVoxels, RetractChanges
+from cairn_server.store.store_rows import MapRow
+
+Looks = dict[tuple[float, ...], tuple[int, ...]]
+"""By the centre of a voxel what a view shows of it: probability, temperature (-1: none), colour."""
+
+
+def previewed(live: Live, row: MapRow, *commits: Commit) -> RetractChanges:
+    answer = live.http.post(f"/maps/{row.name}/main/changes", json={"commits": [str(each.id) for each in commits]})
+    assert answer.status_code == 200, answer.text
+    return RetractChanges.model_validate(answer.json())
+
+
+def looks(live: Live, row: MapRow) -> Looks:
+    """All that is shown of a map, voxel by voxel."""
+    found: Looks = {}
+    for entry in live.http.get(f"/maps/{row.name}/main/cells").json()["cells"]:
+        cell = ",".join(map(str, entry["cell"]))
+        data = live.http.get(f"/maps/{row.name}/main/cells/{cell}.view", params={"depth": row.geometry.depth}).content
+        view = decode_view(data).view
+        voxels = deinterleave(view.nodes.astype(np.uint64)) + np.array(entry["cell"]) * row.geometry.side
+        values = np.full((len(view.nodes), 5), -1)
+        values[:, 0] = view.chances
+        values[view.warm, 1] = view.temperatures[:, 0]
+        values[view.coloured, 2:] = view.rgb
+        places = np.round(centres_of_voxels(voxels, row.geometry), 6).tolist()
+        found |= {tuple(place): tuple(each) for place, each in zip(places, values.tolist(), strict=True)}
+    return found
+
+
+def places(cells: list[CellVoxels]) -> set[tuple[float, ...]]:
+    return {tuple(place) for cell in cells for place in cell.centres_m}
+
+
+@pytest.mark.parametrize("epochs", [False, True])
+def test_a_preview_names_exactly_what_the_retract_changes(live: Live, epochs: bool) -> None:
+    if epochs:
+        row = live.new_map(SMALL, epoch_s=120)
+        layer = MapLayer(geometry=SMALL, epoch_s=120)
+        commits = [pushed_in(Epoch(3 * n), n, seed, layer=layer) for n, seed in enumerate((0, 1, 3, 6))]
+    else:
+        row = live.new_map(SMALL)
+        commits = [pushed(n, seed) for n, seed in enumerate((0, 1, 3, 6))]
+    for commit in commits:
+        assert live.push(row, commit).status_code == 201
+    live.folded(row)
+    before = looks(live, row)
+    named = previewed(live, row, commits[1], commits[3])
+    assert looks(live, row) == before, "nothing is taken out by looking"
+    live.http.post(f"/maps/{row.name}/retracts", json={"commits": [str(commits[n].id) for n in (1, 3)]})
+    live.folded(row)
+    after = looks(live, row)
+    heat = {place: (before[place][1], after[place][1]) for place in before.keys() & after.keys()}
+    both = {place for place, (now, then) in heat.items() if min(now, then) >= 0}
+    assert places(named.gone) == before.keys() - after.keys()
+    assert places(named.appeared) == after.keys() - before.keys()
+    assert places(named.warmer) == {place for place in both if heat[place][1] > heat[place][0]}
+    assert places(named.colder) == {place for place in both if heat[place][1] < heat[place][0]}
+    differing = {place for place in heat if before[place] != after[place]}
+    assert places(named.otherwise) == differing - places(named.warmer) - places(named.colder)
+    assert named.commits == 2
+    assert sum(named.counts.model_dump().values()) == len(differing) + len(before.keys() ^ after.keys()) > 0
+    again = previewed(live, row, commits[1])
+    assert (again.commits, sum(again.counts.model_dump().values())) == (0, 0), "it is out already"
+
+
+def test_previews_are_refused_as_retracts_are(live: Live) -> None:
+    row = live.new_map(SMALL)
+    assert live.push(row, pushed(0, 0)).status_code == 201
+    live.folded(row)
+    kinds = {}
+    for name, body in (("none", {"robot": "nightjar"}), ("retract", {"commits": ["operator.0123456789abcdef.0"]})):
+        kinds[name] = live.http.post(f"/maps/{row.name}/main/changes", json=body).json()["kind"]
+    assert kinds == {"none": "nothing_to_retract", "retract": "not_retractable"}
+    unknown = live.http.post(f"/maps/{row.name}/main/changes", json={"commits": [f"{WREN}.7"]})
+    assert unknown.json()["commits"] == 0
+    assert f"{MOLE}.0" in live.http.get(f"/maps/{row.name}/log").text
