@@ -115,9 +115,8 @@ def plain_content(head: CellHead, head_bytes: bytes, raw: Mapping[int, bytes], *
 def plain_bytes(key: CellKey, evidence: Evidence, geometry: Geometry) -> PlainBytes | None:
     """Canonical bytes of packed evidence that fits the geometry (`check_fits`); None if it is signed."""
     # One kind of array, whatever the evidence was made of: each other kind is another kernel to compile.
-    voxels, counts, sampled, samples = map(
-        _readable, (evidence.voxels, evidence.counts, evidence.sampled, evidence.samples)
-    )
+    voxels, counts = _readable(evidence.voxels), _readable(evidence.counts)
+    sampled, samples = _readable(evidence.sampled), _readable(evidence.samples)
     count_bits = stream_kernels.bits_of_counts(counts)
     if min(count_bits) < 0:
         return None
@@ -148,7 +147,7 @@ def plain_bytes(key: CellKey, evidence: Evidence, geometry: Geometry) -> PlainBy
     np.concatenate(
         [leaf_masks[d, : masks[d]] for d in range(depth - 1)] or [data[:0]], out=data[at[1] : at[1] + size[1]]
     )
-    canonical = memoryview(data)
+    canonical = data.data
     canonical[: len(head)] = head
     for number, first, length in zip(numbers, at.tolist(), size.tolist(), strict=True):
         STREAM_HEAD.pack_into(canonical, first - STREAM_HEAD.size, number, length)

@@ -121,20 +121,20 @@ def write_plain_into(
     leaves = leaf_rows.shape[0]
     for column in range(2):
         s = COLUMNS_FROM + column
-        _counts_into(data[at[s] :], np.int64(planes[s]), leaf_rows, counts, column)
+        _counts_into(data[at[s] :], planes[s], leaf_rows, counts, column)
     s = CHANNELS_FROM
     first = 0
     for c in range(spec.shape[0]):
         for n in range((leaves + 7) // 8):
             data[at[s] + n] = presence[c, n]
         for p in range(spec[c, 0]):
-            _column_into(data[at[s + 1 + p] :], np.int64(planes[s + 1 + p]), words[first + p, : rows[c]])
+            _column_into(data[at[s + 1 + p] :], planes[s + 1 + p], words[first + p, : rows[c]])
         s += 1 + spec[c, 0]
         first += spec[c, 0]
 
 
 @nb.njit(nogil=True)
-def _counts_into(data: Bytes, planes: int, leaf_rows: Ints, counts: Int32s, column: int) -> None:
+def _counts_into(data: Bytes, planes: int | np.int64, leaf_rows: Ints, counts: Int32s, column: int) -> None:
     """Write a column of counts, one of each leaf."""
     leaves = leaf_rows.shape[0]
     data[0] = planes
@@ -145,7 +145,7 @@ def _counts_into(data: Bytes, planes: int, leaf_rows: Ints, counts: Int32s, colu
 
 
 @nb.njit(nogil=True)
-def _column_into(data: Bytes, planes: int, words: Words) -> None:
+def _column_into(data: Bytes, planes: int | np.int64, words: Words) -> None:
     """Write a column of words: the number of its planes, then the planes, lowest bytes first."""
     rows = words.shape[0]
     data[0] = planes
