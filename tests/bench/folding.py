@@ -1,4 +1,5 @@
-"""Fold lag: the time from an honest commit's receipt until it is in the map, alone and next to costly commits.
+"""Fold lag: the time from an honest commit's receipt until it is in the map, alone and next to costly commits; and the
+processor time of folding, of each commit alone and of many together.
 
 Thirty commits of another robot, of a few hundred bytes each, stand for one voxel in each of 2^17 bricks (dust), or for
 two cells full of equal air. Each ratio is against the same robot's commits on the same server before they came.
@@ -6,8 +7,10 @@ two cells full of equal air. Each ratio is against the same robot's commits on t
 
 import json
 import statistics
+import tempfile
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 from tests.bench.pushing import Bodies, Diff, Robot, Server, served
 from tests.fixtures.map.costly import air, dust
@@ -15,6 +18,11 @@ from tests.fixtures.map.costly import air, dust
 from cairn_map.commits.ids import commit_id_from_text
 from cairn_map.commits.version_vector import version_vector_from_json
 from cairn_map.evidence.grid import Geometry, cell_key
+from cairn_map.evidence.inverse_sensor_model import SensorModel
+from cairn_server.folding.damaged_cells import DamagedCells
+from cairn_server.folding.group_folding import LocalFolding
+from cairn_server.store.sqlite.store import SqliteStore
+from cairn_server.store.store_rows import MapRow
 
 Row = tuple[str, str, str]
 
@@ -40,6 +48,35 @@ def fold_lag_rows(diffs: list[Diff], geometry: Geometry, *, smoke: bool) -> Iter
             f"{ratio:.1f}",
             f"times as long; the first {beside_s[0] / quiet_s:.1f}, the longest {max(beside_s) / quiet_s:.1f}",
         )
+
+
+def fold_cost_rows(diffs: list[Diff], geometry: Geometry, *, smoke: bool) -> Iterator[Row]:
+    """Processor time of the fold, with the store's, once the map has all of these diffs."""
+    bodies = Bodies(diffs, geometry)
+    size = sum(len(body) for n in range(len(diffs)) for body in bodies.commit("wren", n).diff.values()) // len(diffs)
+    for group in (1, 4) if smoke else (1, 24):
+        count = -(-len(diffs) // group) * group
+        with tempfile.TemporaryDirectory() as folder:
+            store = SqliteStore(Path(folder))
+            row, _ = store.create_map("bench", geometry, SensorModel())
+            folding = LocalFolding(store, DamagedCells())
+            _fold_groups(store, row, folding, bodies, range(count), group)  # which loads kernels
+            start_s = time.process_time()
+            _fold_groups(store, row, folding, bodies, range(count, 2 * count), group)
+            took_s = time.process_time() - start_s
+            folding.close()
+            store.close()
+        yield f"{size} B pushed and folded in groups of {group}", f"{1e3 * took_s / count:.1f}", "ms CPU a commit"
+
+
+def _fold_groups(
+    store: SqliteStore, row: MapRow, folding: LocalFolding, bodies: Bodies, numbers: range, group: int
+) -> None:
+    for first in numbers[::group]:
+        for n in range(first, first + group):
+            store.append(row, bodies.commit("wren", n))
+        while folding.fold(row).commits:
+            pass
 
 
 def _lag_s(server: Server, name: str, bodies: Bodies, n: int) -> float:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from tests.bench.fetching import fetching_rows
-from tests.bench.folding import fold_lag_rows
+from tests.bench.folding import fold_cost_rows, fold_lag_rows
 from tests.bench.pushing import BOMB_BYTES, Bodies, Diff, Robot, bomb, meta_of, served
 
 from cairn_fusion.mapping.integrate import Integrator, integrate_scans
@@ -50,6 +50,7 @@ def server_rows(smoke: bool) -> Iterator[Row]:
         yield from _push_rows(name, diffs, geometry, seconds=1.0 if smoke else 30.0)
         if robot == "tof":
             yield from _store_rows(name, diffs, geometry, commits=200 if smoke else 10_000)
+        yield from fold_cost_rows(diffs, geometry, smoke=smoke)
     yield from _visible_rows(diffs, geometry, pushes=10 if smoke else 200)
     yield from _bomb_rows(diffs[0], geometry)
     fine = geometry_for(voxel_edge_m=0.02)

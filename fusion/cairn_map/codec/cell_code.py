@@ -36,6 +36,7 @@ from cairn_map.codec.octree.cell_content import (
 from cairn_map.codec.octree.cell_head import CellHead, encode_head
 from cairn_map.codec.octree.channel_streams import ChannelRows, stream_of_channel
 from cairn_map.codec.octree.streams import MODELLED, StoredStream, join_streams, stored_streams
+from cairn_map.codec.plain_cell import plain_bytes
 from cairn_map.errors import DamagedDataError
 from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.compact_cell import CellCoding
@@ -95,6 +96,9 @@ def encode_cell(
     """
     # The canonical streams, over which the digest is taken (FORMAT.md sections 4 and 5), each under zstd.
     check_fits(evidence, geometry)
+    plain = plain_bytes(key, evidence, geometry) if Profile(profile) is Profile.FAST else None
+    if plain is not None:
+        return EncodedCell(bytes(plain.head) + join_streams(stored_streams(plain.streams)), _digest(plain.canonical))
     signed, content = evidence.is_signed, content_of(evidence, geometry)
     parts = channel_streams.split_samples(content.sampled, content.samples, geometry)
     head, streams = _canonical(key, content, parts, geometry, voxels=len(evidence), signed=signed)
@@ -154,7 +158,7 @@ def cell_digest(key: CellKey, evidence: Evidence, geometry: Geometry) -> bytes:
     Raises:
         BadInputError: kind `bad_evidence`: it is not of this geometry.
     """
-    return _digest(canonical_bytes(*_encoded(key, evidence, geometry)))
+    return _digest(_canonical_bytes(key, evidence, geometry))
 
 
 def decode_cell(data: bytes, *, evidence_bytes_max: int = EVIDENCE_BYTES_MAX) -> DecodedCell:
@@ -205,7 +209,7 @@ def read_canonical_cell(reader: CellReader) -> CanonicalCell:
     head, content = reader.head, reader.content()
     is_canonical, data = reader.is_canonical(content), reader.canonical_bytes()
     if is_canonical is None:
-        is_canonical = canonical_bytes(*_encoded(head.key, evidence_of(content), head.geometry)) == data
+        is_canonical = _canonical_bytes(head.key, evidence_of(content), head.geometry) == data
     if not is_canonical:
         raise DamagedDataError("not_canonical", f"cell {cell_of_key(head.key)} is not in canonical form")
     return CanonicalCell(head.key, head.geometry, content, _digest(data))
@@ -219,6 +223,13 @@ def recompressed_cell(data: bytes, *, profile: Profile) -> bytes:
     """
     cell = decode_canonical_cell(data)
     return encode_cell(cell.key, cell.evidence, cell.geometry, profile=profile).data
+
+
+def _canonical_bytes(key: CellKey, evidence: Evidence, geometry: Geometry) -> bytes | memoryview:
+    """Canonical bytes of evidence."""
+    check_fits(evidence, geometry)
+    plain = plain_bytes(key, evidence, geometry)
+    return plain.canonical if plain is not None else canonical_bytes(*_encoded(key, evidence, geometry))
 
 
 def _encoded(key: CellKey, evidence: Evidence, geometry: Geometry) -> tuple[bytes, dict[int, bytes]]:
@@ -264,5 +275,5 @@ def _group(number: int) -> int:
     return {CHILD_MASKS: CHILD_MASKS, LEAF_MASKS: CHILD_MASKS, HITS: HITS, MISSES: HITS}.get(number, number & ~7)
 
 
-def _digest(data: bytes) -> bytes:
+def _digest(data: bytes | memoryview) -> bytes:
     return hashlib.sha256(data).digest()

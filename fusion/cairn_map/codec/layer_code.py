@@ -132,7 +132,8 @@ def read_cell(data: bytes, key: CellKey, layer: MapLayer) -> HistoryCell:
         decoded = decode_cell(body)
         _check_is(decoded.key, MapLayer(geometry=decoded.geometry), key, MapLayer(geometry=layer.geometry))
         if len(decoded.evidence):
-            cell.put(epoch, _coded(key, epoch, decoded.evidence, EncodedCell(body, decoded.digest), layer))
+            fingerprint = row_fingerprint(decoded.evidence, epoch, key, layer_word=layer.word)
+            cell.put(epoch, _coded(decoded.evidence, EncodedCell(body, decoded.digest), fingerprint, layer))
     return cell
 
 
@@ -167,20 +168,18 @@ def write_cell(cell: HistoryCell, *, profile: Profile = Profile.FAST) -> Written
 def row_coding(layer: MapLayer) -> RowCoding:
     """Code by which the rows of a map's cells are held as bytes."""
 
-    def encode(key: CellKey, epoch: Epoch, evidence: Evidence) -> CodedRow:
-        return _coded(key, epoch, evidence, encode_cell(key, evidence, layer.geometry), layer)
+    def encode(key: CellKey, epoch: Epoch, evidence: Evidence, fingerprint: Fingerprint) -> CodedRow:
+        return _coded(evidence, encode_cell(key, evidence, layer.geometry), fingerprint, layer)
 
-    return RowCoding(encode=encode, decode=lambda row: decode_cell(row.data).evidence)
-
-
-def _coded(key: CellKey, epoch: Epoch, evidence: Evidence, encoded: EncodedCell, layer: MapLayer) -> CodedRow:
-    return CodedRow(
-        encoded.data,
-        encoded.digest,
-        row_fingerprint(evidence, epoch, key, layer_word=layer.word),
-        len(evidence),
-        hottest_k(evidence, layer.geometry),
+    return RowCoding(
+        encode=encode,
+        decode=lambda row: decode_cell(row.data).evidence,
+        fingerprint=lambda key, epoch, evidence: row_fingerprint(evidence, epoch, key, layer_word=layer.word),
     )
+
+
+def _coded(evidence: Evidence, encoded: EncodedCell, fingerprint: Fingerprint, layer: MapLayer) -> CodedRow:
+    return CodedRow(encoded.data, encoded.digest, fingerprint, len(evidence), hottest_k(evidence, layer.geometry))
 
 
 def row_bodies(data: bytes, key: CellKey, layer: MapLayer) -> Mapping[Epoch, bytes]:

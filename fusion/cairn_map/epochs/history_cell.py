@@ -5,7 +5,8 @@
     base       bytes
 
 A map without epochs has the base alone. `merge` and `unmerge` are exact inverses, in any order, because both are
-integer addition, row by row. `CellHistory` is the same as a value; `codec.history_code` has the bytes.
+integer addition, row by row. A row's fingerprint is linear, too: those of few changes are added to it, instead of one
+of all voxels at the end. `CellHistory` is the same as a value; `codec.history_code` has the bytes.
 """
 
 from collections.abc import Callable, Iterator
@@ -18,7 +19,7 @@ from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.brick_cell import BrickCell, brick_cell
 from cairn_map.evidence.evidence import Evidence
-from cairn_map.evidence.fingerprint import Fingerprint
+from cairn_map.evidence.fingerprint import ZERO, Fingerprint
 from cairn_map.evidence.grid import CellKey
 
 VOXEL_BYTES = 4
@@ -42,18 +43,24 @@ class CodedRow(NamedTuple):
 class RowCoding:
     """Code of rows as bytes; `codec.history_code.row_coding` is the one of the map format."""
 
-    encode: Callable[[CellKey, Epoch, Evidence], CodedRow]
+    encode: Callable[[CellKey, Epoch, Evidence, Fingerprint], CodedRow]
+    """Bytes of evidence of this fingerprint."""
     decode: Callable[[CodedRow], Evidence]
+    fingerprint: Callable[[CellKey, Epoch, Evidence], Fingerprint]
 
 
 class _Row:
-    """Sums, bytes, or both if the bytes are of these sums."""
+    """Sums, bytes, or both if the bytes are of these sums; and the fingerprint of either."""
 
-    __slots__ = ("coded", "sums")
+    __slots__ = ("coded", "fingerprint", "sums", "voxels_left")
 
-    def __init__(self, sums: BrickCell | None = None, coded: CodedRow | None = None) -> None:
+    def __init__(self, sums: BrickCell | None, coded: CodedRow | None, fingerprint: Fingerprint, voxels: int) -> None:
         self.sums = sums
         self.coded = coded
+        self.fingerprint: Fingerprint | None = fingerprint
+        """None: it is to be computed of all voxels."""
+        self.voxels_left = voxels
+        """Voxels of changes up to which adding their fingerprints is less work than that of all voxels."""
 
     @property
     def size_bytes(self) -> int:
@@ -78,7 +85,11 @@ class HistoryCell:
 
     def put(self, epoch: Epoch, row: CodedRow) -> None:
         """Add a row of which there is none yet, as its bytes."""
-        self._rows[epoch] = _Row(coded=row)
+        self._rows[epoch] = _Row(None, row, row.fingerprint, row.voxels)
+
+    def open(self, epoch: Epoch, evidence: Evidence, fingerprint: Fingerprint) -> None:
+        """Add a row of which there is none yet, as the sums of its evidence, which has this fingerprint."""
+        self._rows[epoch] = _Row(brick_cell(self.layer.geometry, [evidence]), None, fingerprint, len(evidence))
 
     def merge(self, epoch: Epoch, diff: Evidence) -> None:
         """Add a diff to the row of an epoch.
@@ -88,7 +99,7 @@ class HistoryCell:
                 geometry; `too_large`: one row more than `ROWS_MAX`; nothing was changed.
         """
         self._sums(epoch).merge(diff)
-        self._rows[epoch].coded = None
+        self._note_change(epoch, diff, Fingerprint.__add__)
 
     def unmerge(self, epoch: Epoch, diff: Evidence) -> None:
         """Take a diff out of the row of an epoch; after it, the cell is what it was before `merge(epoch, diff)`.
@@ -97,7 +108,7 @@ class HistoryCell:
             BadInputError: as `merge`.
         """
         self._sums(epoch).unmerge(diff)
-        self._rows[epoch].coded = None
+        self._note_change(epoch, diff, Fingerprint.__sub__)
 
     def history(self) -> CellHistory:
         """All rows as packed evidence."""
@@ -110,7 +121,10 @@ class HistoryCell:
             if row.coded is None:
                 evidence = self._packed(row)
                 if len(evidence):
-                    row.coded = self._coding.encode(self.key, epoch, evidence)
+                    if row.fingerprint is None:
+                        row.fingerprint = self._coding.fingerprint(self.key, epoch, evidence)
+                    row.coded = self._coding.encode(self.key, epoch, evidence, row.fingerprint)
+                    row.voxels_left = len(evidence)
                 else:
                     del self._rows[epoch]
         return {epoch: row.coded for epoch in self if (row := self._rows[epoch]).coded is not None}
@@ -138,12 +152,23 @@ class HistoryCell:
         """Memory held by the rows' arrays and bytes."""
         return sum(row.size_bytes for row in self._rows.values())
 
+    def _note_change(
+        self, epoch: Epoch, diff: Evidence, add: Callable[[Fingerprint, Fingerprint], Fingerprint]
+    ) -> None:
+        row = self._rows[epoch]
+        row.coded = None
+        row.voxels_left -= len(diff)
+        if row.fingerprint is not None and row.voxels_left >= 0:
+            row.fingerprint = add(row.fingerprint, self._coding.fingerprint(self.key, epoch, diff))
+        else:
+            row.fingerprint = None
+
     def _sums(self, epoch: Epoch) -> BrickCell:
         row = self._rows.get(epoch)
         if row is None:
             if len(self._rows) >= ROWS_MAX:
                 raise BadInputError("too_large", f"a cell has at most {ROWS_MAX} rows of epochs")
-            row = self._rows[epoch] = _Row(BrickCell(self.layer.geometry))
+            row = self._rows[epoch] = _Row(BrickCell(self.layer.geometry), None, ZERO, 0)
         if row.sums is None:
             row.sums = brick_cell(self.layer.geometry, [self._packed(row)])
         return row.sums

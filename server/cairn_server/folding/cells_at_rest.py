@@ -98,7 +98,7 @@ def _opened(stored: CellRow, layer: MapLayer) -> HistoryCell:
         # Its one row is about to be changed: decoded once, not to bytes and again to sums.
         cell = HistoryCell(stored.key, layer, row_coding(layer))
         for epoch, row in stored_history(stored, layer).rows.items():
-            cell.merge(epoch, row)
+            cell.open(epoch, row, stored.fingerprint)
         return cell
     try:
         cell = read_cell(stored.body, stored.key, layer)

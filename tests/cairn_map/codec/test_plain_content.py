@@ -1,4 +1,4 @@
-"""A cell read all at once against the same cell read stream by stream, which is the slow twin: sound or not."""
+"""A cell read or written all at once against the same stream by stream, which is the slow twin: sound or not."""
 
 import struct
 from collections.abc import Callable
@@ -9,14 +9,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.fixtures.map.made import GEOMETRIES, KEY, any_evidence, random_evidence, surface_evidence
 
-from cairn_map.codec import cell_reading
-from cairn_map.codec.cell_code import decode_canonical_cell, decode_cell, encode_cell
+from cairn_map.codec import cell_code, cell_reading
+from cairn_map.codec.cell_code import EncodedCell, cell_digest, decode_canonical_cell, decode_cell, encode_cell
 from cairn_map.codec.cell_reading import CellReader, cell_reader
 from cairn_map.codec.octree.cell_content import CellContent
 from cairn_map.codec.octree.cell_head import FIXED_PART
 from cairn_map.codec.octree.streams import STORED, StoredStream, join_streams
 from cairn_map.errors import CairnError
-from cairn_map.evidence.evidence import Evidence
+from cairn_map.evidence.brick_cell import difference
+from cairn_map.evidence.evidence import Evidence, empty_evidence
 from cairn_map.evidence.grid import Geometry
 
 Arrays = list[list[int]]
@@ -26,6 +27,13 @@ KINDS = {"bad_octree", "bad_cell", "bad_stream", "too_large", "not_canonical"}
 def slowly(reader: CellReader) -> CellContent:
     """Read stream by stream."""
     return CellReader(reader.head, reader.head_bytes, reader.stored, reader.sampled_max, is_plain=False).content()
+
+
+def written_slowly(evidence: Evidence, geometry: Geometry) -> EncodedCell:
+    """Write stream by stream."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cell_code, "plain_bytes", lambda *_: None)
+        return encode_cell(KEY, evidence, geometry)
 
 
 def arrays_of(content: CellContent) -> Arrays:
@@ -94,6 +102,29 @@ def test_raw_streams_with_any_bytes_changed_are_refused_by_both_or_read_alike(da
         assert not canonical
     else:
         assert canonical
+
+
+@pytest.mark.parametrize("geometry", GEOMETRIES, ids=["small", "middle", "plain"])
+def test_real_cells_are_the_same_written_at_once(geometry: Geometry) -> None:
+    made = [random_evidence(seed, geometry) for seed in range(20)]
+    made += [surface_evidence(1, geometry), empty_evidence(geometry), difference(made[0], made[1], geometry)]
+    for evidence in made:
+        slow = written_slowly(evidence, geometry)
+        assert encode_cell(KEY, evidence, geometry) == slow
+        assert cell_digest(KEY, evidence, geometry) == slow.digest
+
+
+@given(any_evidence(GEOMETRIES[0]))
+def test_numbers_of_every_size_are_the_same_written_at_once(evidence: Evidence) -> None:
+    slow = written_slowly(evidence, GEOMETRIES[0])
+    assert encode_cell(KEY, evidence, GEOMETRIES[0]) == slow
+    # However its arrays lie in memory.
+    strided = Evidence(*(np.repeat(array, 2, axis=0)[::2] for array in arrays_in(evidence)))
+    assert encode_cell(KEY, strided, GEOMETRIES[0]) == slow
+
+
+def arrays_in(evidence: Evidence) -> list[np.ndarray]:  # type: ignore[type-arg]
+    return [evidence.voxels, evidence.counts, evidence.sampled, evidence.samples]
 
 
 def test_leaves_that_could_be_one_are_found_wherever_they_are() -> None:

@@ -1,5 +1,7 @@
 """Maps and cells with epochs to which commits are added and taken out again: any order, exact inverses, equal bytes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -76,13 +78,28 @@ def test_reading_undoes_writing(history: CellHistory) -> None:
     assert decode_layer_cell(written.data, KEY, LAYER).digest == written.digest
 
 
+@pytest.mark.parametrize("layer", [PLAIN, LAYER], ids=["plain", "epochs"])
+@pytest.mark.parametrize("is_written", [True, False], ids=["written", "added"])
+def test_a_fingerprint_that_was_added_to_is_that_of_all_voxels(layer: MapLayer, is_written: bool) -> None:
+    epoch, merge, unmerge = Epoch(3) if layer.has_epochs else BASE, HistoryCell.merge, HistoryCell.unmerge
+    cell = cell_of(cell_history({epoch: random_evidence(1, SMALL, voxels=200)}), layer)
+    large, *small = (random_evidence(seed, SMALL, voxels=20, air=3 if seed == 2 else 0) for seed in range(2, 6))
+    write_cell(cell)
+    steps = [(merge, small[0]), (merge, small[1]), (unmerge, small[0]), (merge, large), (unmerge, large)]
+    for step, diff in [*steps, (merge, small[2])]:
+        step(cell, epoch, diff)
+        if is_written:
+            assert write_cell(cell).fingerprint == history_fingerprint(cell.history(), KEY, layer_word=layer.word)
+            cell = read_cell(write_cell(cell).data, KEY, layer)
+    assert write_cell(cell).fingerprint == history_fingerprint(cell.history(), KEY, layer_word=layer.word)
+
+
 def test_rows_at_rest_are_copied_and_only_the_changed_one_is_coded(monkeypatch: pytest.MonkeyPatch) -> None:
     cell = read_cell(write_cell(cell_of(random_history(1))).data, KEY, LAYER)
     newest, coded = max(cell), []
     coding = row_coding(LAYER)
-    monkeypatch.setattr(
-        cell, "_coding", type(coding)(lambda *row: coded.append(row[1]) or coding.encode(*row), coding.decode)
-    )
+    noting = replace(coding, encode=lambda *row: coded.append(row[1]) or coding.encode(*row))
+    monkeypatch.setattr(cell, "_coding", noting)
     cell.merge(newest, random_evidence(9, SMALL))
     write_cell(cell)
     assert coded == [newest]

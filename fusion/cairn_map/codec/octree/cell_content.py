@@ -7,6 +7,7 @@ evidence  <->  content  <->  raw streams, which are canonical          `channel_
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +19,8 @@ from cairn_map.codec.octree.word_columns import numbers_into, words
 from cairn_map.errors import DamagedDataError
 from cairn_map.evidence.evidence import COUNT_MAX, Evidence
 from cairn_map.evidence.grid import Geometry
+
+T = TypeVar("T", bound=np.generic)
 
 CHILD_MASKS, LEAF_MASKS, HITS, MISSES = 1, 2, 3, 4
 BAD_LEAF = "bad_cell", "a leaf says nothing, or a collapsed one holds samples"
@@ -75,7 +78,7 @@ def evidence_of(content: CellContent) -> Evidence:
     octree, counts, sampled = content.octree, content.counts, content.sampled
     V = int(octree.sizes.sum())
     # In one block, counts first, so that two of them can be read as one number of 64 bits.
-    block = _large_empty(3 * V + len(sampled))
+    block = large_empty(3 * V + len(sampled), np.uint32)
     pairs, voxels, rows_of_samples = block[: 2 * V], block[2 * V : 3 * V], block[3 * V :]
     evidence = Evidence(voxels, pairs.view(np.int32).reshape(V, 2), rows_of_samples, content.samples)
     rows = (evidence.voxels, evidence.counts, evidence.sampled)
@@ -97,13 +100,14 @@ def met_of(content: CellContent) -> CellContent:
     return CellContent(part, content.counts[leaves], np.searchsorted(leaves, sampled), content.samples)
 
 
-def _large_empty(count: int) -> npt.NDArray[np.uint32]:
+def large_empty(count: int, kind: type[T]) -> npt.NDArray[T]:
     """(count,) fresh memory, in large pages if it is large: else the page faults take longer than writing it.
 
     NumPy asks for large pages from 4 MB on. The rest of such a block is never touched, and so costs nothing.
     """
-    whole = max(count, LARGE_PAGES_FROM_BYTES // 4) if 4 * count >= WORTH_BYTES else count
-    return np.empty(whole, np.uint32)[:count]
+    item_bytes = np.dtype(kind).itemsize
+    whole = max(count, LARGE_PAGES_FROM_BYTES // item_bytes) if item_bytes * count >= WORTH_BYTES else count
+    return np.empty(whole, kind)[:count]
 
 
 def canonical_bytes(head: bytes, streams: Mapping[int, bytes]) -> bytes:

@@ -52,20 +52,22 @@ class StoredStream(NamedTuple):
         return self.body
 
 
-def stored_streams(streams: Mapping[int, bytes]) -> list[StoredStream]:
+def stored_streams(streams: Mapping[int, bytes | memoryview]) -> list[StoredStream]:
     """Streams in the order given, compressed where that helps."""
     compressor = zstandard.ZstdCompressor(level=ZSTD_LEVEL, write_content_size=False, write_checksum=False)
     stored: list[StoredStream] = []
     for number, raw in streams.items():
-        packed = compressor.compress(raw) if len(raw) > 16 else raw
-        coding, body = (ZSTD, packed) if len(packed) < len(raw) else (STORED, raw)
-        stored.append(StoredStream(number, coding, len(raw), body))
+        packed = compressor.compress(raw) if len(raw) > 16 else b""
+        is_shorter = 0 < len(packed) < len(raw)
+        body = packed if is_shorter else bytes(raw)
+        stored.append(StoredStream(number, ZSTD if is_shorter else STORED, len(raw), body))
     return stored
 
 
 def join_streams(streams: list[StoredStream]) -> bytes:
     """Streams with their heads, one after the other."""
-    return b"".join(HEAD.pack(s.number, s.coding, s.raw_bytes, len(s.body)) + s.body for s in streams)
+    heads = [HEAD.pack(s.number, s.coding, s.raw_bytes, len(s.body)) for s in streams]
+    return b"".join(part for head, stream in zip(heads, streams, strict=True) for part in (head, stream.body))
 
 
 def split_streams(data: bytes, *, count: int, raw_bytes_max: int = RAW_BYTES_MAX) -> dict[int, StoredStream]:
