@@ -6,18 +6,21 @@ from tests.fixtures.client.made import GEOMETRY
 from tests.sync_sim.server import SimServer
 
 from cairn_map.epochs.layer import LayerDefinition, MapLayer
-from cairn_map.evidence.grid import Geometry
+from cairn_map.evidence.grid import Geometry, level_geometry
 from cairn_map.wire.layer_messages import AddLayer
 from cairn_server.access.auth import Caller, Role
 
 BY = Caller(Role.ADMIN, name="ada")
-DEFINITIONS = tuple(
-    LayerDefinition(
-        name=f"at_{edge_um}",
-        geometry=Geometry(voxel_edge_um=edge_um, depth=3, channels=GEOMETRY.channels),
-        epoch_s=120 if edge_um > 50_000 else None,
-    )
-    for edge_um in (10_000, 20_000, 200_000)
+DEFINITIONS = (
+    *(
+        LayerDefinition(
+            name=f"at_{edge_um}",
+            geometry=Geometry(voxel_edge_um=edge_um, depth=3, channels=GEOMETRY.channels),
+            epoch_s=120 if edge_um > 50_000 else None,
+        )
+        for edge_um in (10_000, 20_000, 200_000)
+    ),
+    LayerDefinition(name="ground", geometry=level_geometry(), epoch_s=120),
 )
 """One for each name: servers that are joined may define the same one, each by a commit of its own."""
 Layers = dict[str, MapLayer]

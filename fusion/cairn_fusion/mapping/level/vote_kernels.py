@@ -63,17 +63,19 @@ def column_votes(
         x, y, lowest = voxels[first, 0], voxels[first, 1], heights[0] // step_nm
         if count + 2 * K + CROSSED_BINS > len(offsets):
             found, offsets, is_hit = _grown(found, offsets, is_hit, 2 * (len(offsets) + K))
-        # Stage 2: bins that beams crossed on their way to a return of this column, as bits from the lowest one's on.
-        taken, crossed = np.uint64(0), np.uint64(0)
-        for n in order[start:stop]:
-            own = voxels[n, 2] - lowest
-            if own < CROSSED_BINS:
-                taken |= np.uint64(1) << np.uint64(own)
-            entry = _entry_bin(points_m[n], origin_m, x, y, size_nm) - lowest
-            for each in range(own + 1, min(entry, CROSSED_BINS - 1) + 1):
-                crossed |= np.uint64(1) << np.uint64(each)
-            for each in range(max(entry, 0), min(own, CROSSED_BINS)):
-                crossed |= np.uint64(1) << np.uint64(each)
+        # Stage 2: bins that beams crossed on their way to a return of this column, as bits from the lowest one's on;
+        # only they are told that lie above the reach of a vote, and below another return.
+        taken, crossed, highest = np.uint64(0), np.uint64(0), heights[K - 1] // step_nm - lowest
+        if highest > TALL_BINS + 1:
+            for n in order[start:stop]:
+                own = voxels[n, 2] - lowest
+                if own < CROSSED_BINS:
+                    taken |= np.uint64(1) << np.uint64(own)
+                entry = _entry_bin(points_m[n], origin_m, x, y, size_nm) - lowest
+                for each in range(own + 1, min(entry, CROSSED_BINS - 1) + 1):
+                    crossed |= np.uint64(1) << np.uint64(each)
+                for each in range(max(entry, 0), min(own, CROSSED_BINS)):
+                    crossed |= np.uint64(1) << np.uint64(each)
         # Stage 3: surfaces; each votes for the mean of the returns within a step above its lowest.
         low = 0
         while low < K:
@@ -97,9 +99,8 @@ def column_votes(
             low = high
         # Stage 4: crossed bins from which nothing came back, below others of this column from which something did.
         crossed &= ~taken & ~((np.uint64(1) << np.uint64(TALL_BINS + 1)) - np.uint64(1))
-        top = heights[K - 1] // step_nm - lowest
-        if top < CROSSED_BINS:
-            crossed &= (np.uint64(1) << np.uint64(top)) - np.uint64(1)
+        if highest < CROSSED_BINS:
+            crossed &= (np.uint64(1) << np.uint64(highest)) - np.uint64(1)
         each = 0
         while crossed != 0:
             if crossed & np.uint64(1):
