@@ -22,7 +22,12 @@ SHADE = 0.5
 
 
 def elevation_png(elevation: Elevation, vehicle: Vehicle = STANDARD_VEHICLE) -> bytes:
-    """The difficulty of the ground for a vehicle, as a PNG; a pixel is a column."""
+    """The difficulty of the ground for a vehicle, as a PNG; a pixel is a column.
+
+    Args:
+        elevation: the ground.
+        vehicle: whose limits are drawn in red.
+    """
     values = elevation.difficulty(vehicle)
     known = np.isfinite(values)
     level = np.where(known, values, 0.0)

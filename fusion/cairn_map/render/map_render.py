@@ -181,6 +181,7 @@ class MapRenderer:
         is_beyond: bool,
     ) -> SurfaceImage:
         # Check, and convert to what the kernel takes: lengths in voxel edges, float32.
+        # Rays step by one edge along all three axes.
         check_cubes(frozen.geometry)
         T = checked_pose(T_map_camera, reach_m=frozen.reach_m)
         H, W, edge_m = sight.height, sight.width, frozen.geometry.voxel_edge_m

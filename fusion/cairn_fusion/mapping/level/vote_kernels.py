@@ -63,19 +63,11 @@ def column_votes(
         x, y, lowest = voxels[first, 0], voxels[first, 1], heights[0] // step_nm
         if count + 2 * K + CROSSED_BINS > len(offsets):
             found, offsets, is_hit = _grown(found, offsets, is_hit, 2 * (len(offsets) + K))
-        # Stage 2: bins that beams crossed on their way to a return of this column, as bits from the lowest one's on;
-        # only they are told that lie above the reach of a vote, and below another return.
-        taken, crossed, highest = np.uint64(0), np.uint64(0), heights[K - 1] // step_nm - lowest
+        # Stage 2: bins that beams crossed, as bits from the lowest return's on: above the reach of a vote there, and
+        # below another return.
+        crossed, highest = np.uint64(0), heights[K - 1] // step_nm - lowest
         if highest > TALL_BINS + 1:
-            for n in order[start:stop]:
-                own = voxels[n, 2] - lowest
-                if own < CROSSED_BINS:
-                    taken |= np.uint64(1) << np.uint64(own)
-                entry = _entry_bin(points_m[n], origin_m, x, y, size_nm) - lowest
-                for each in range(own + 1, min(entry, CROSSED_BINS - 1) + 1):
-                    crossed |= np.uint64(1) << np.uint64(each)
-                for each in range(max(entry, 0), min(own, CROSSED_BINS)):
-                    crossed |= np.uint64(1) << np.uint64(each)
+            crossed = _crossed_bins(order[start:stop], voxels, points_m, origin_m, size_nm, lowest, highest)
         # Stage 3: surfaces; each votes for the mean of the returns within a step above its lowest.
         low = 0
         while low < K:
@@ -91,16 +83,13 @@ def column_votes(
             offsets[count], is_hit[count] = (vote - own * step_nm + offset_nm // 2) // offset_nm, True
             count += 1
             if own - lowest < CROSSED_BINS:
-                taken |= np.uint64(1) << np.uint64(own - lowest)
+                crossed &= ~(np.uint64(1) << np.uint64(own - lowest))
             if top - own > TALL_BINS:
                 found[count, 0], found[count, 1], found[count, 2] = x, y, top
                 offsets[count], is_hit[count] = NO_VOTE, True
                 count += 1
             low = high
-        # Stage 4: crossed bins from which nothing came back, below others of this column from which something did.
-        crossed &= ~taken & ~((np.uint64(1) << np.uint64(TALL_BINS + 1)) - np.uint64(1))
-        if highest < CROSSED_BINS:
-            crossed &= (np.uint64(1) << np.uint64(highest)) - np.uint64(1)
+        # Stage 4: of these, the ones from which nothing came back.
         each = 0
         while crossed != 0:
             if crossed & np.uint64(1):
@@ -111,6 +100,29 @@ def column_votes(
             each += 1
         start = stop
     return found[:count], offsets[:count], is_hit[:count]
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy")
+def _crossed_bins(
+    rows: Ints, voxels: Ints, points_m: Floats, origin_m: Floats, size_nm: Ints, lowest: int, highest: int
+) -> np.uint64:
+    """Bits of the bins of one column, from its lowest return's on, that beams crossed and from which none came back."""
+    taken, crossed, one = np.uint64(0), np.uint64(0), np.uint64(1)
+    for n in rows:
+        own = voxels[n, 2] - lowest
+        if own < CROSSED_BINS:
+            taken |= one << np.uint64(own)
+        # A beam from above crossed the bins over its end, one from below those under it.
+        entry = _entry_bin(points_m[n], origin_m, voxels[n, 0], voxels[n, 1], size_nm) - lowest
+        for each in range(own + 1, min(entry, CROSSED_BINS - 1) + 1):
+            crossed |= one << np.uint64(each)
+        for each in range(max(entry, 0), min(own, CROSSED_BINS)):
+            crossed |= one << np.uint64(each)
+    # Within reach of a vote no top is hit; above the highest return nothing hinders.
+    crossed &= ~taken & ~((one << np.uint64(TALL_BINS + 1)) - one)
+    if highest < CROSSED_BINS:
+        crossed &= (one << np.uint64(highest)) - one
+    return crossed
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")

@@ -44,15 +44,17 @@ def columns_into(
     """
     start = 0
     while start < len(columns):
+        # Stage 1: the voxels of one column, and all its votes.
         stop, total = start, 0
         while stop < len(columns) and columns[stop] == columns[start]:
             total += votes[stop]
             stop += 1
+        # Stage 2: from below, the first window that holds enough of them; where there is none, there is no surface.
         column = columns[start]
         for low in range(start, stop):
             if votes[low] == 0:
                 continue
-            # Votes of the bins from this one on, as many as the window has.
+            # Votes of the bins from this one on, as many as the window has; it begins at a vote, never at a gap.
             count, height, high = 0, 0.0, low
             while high < stop and bins[high] - bins[low] < WINDOW_BINS:
                 count += votes[high]
@@ -60,12 +62,13 @@ def columns_into(
                 high += 1
             if count < VOTES_MIN or 100 * count < SHARE_PERCENT * total:
                 continue
+            # Stage 3: the mean, and the spread of the bins' own means about it.
             mean, squares = height / count, 0.0
             for each in range(low, high):
                 if votes[each] > 0:
                     squares += votes[each] * (bins[each] * step_mm + offsets_mm[each] / votes[each] - mean) ** 2
             height_mm[column], variance_mm2[column], surface_votes[column] = mean, squares / count, count
-            # From above, what as many scans saw as make a surface.
+            # Stage 4: from above, what as many scans saw as make a surface.
             seen = 0
             for each in range(stop - 1, high - 1, -1):
                 if occupied[each] and bins[each] * step_mm < mean + clearance_mm:
