@@ -305,7 +305,9 @@ def _place(origin_m: tuple[float, float]) -> str:
 
 def _numbers(values: npt.NDArray[Any]) -> Any:
     """An array as nested lists for JSON, unknown numbers null."""
-    return np.where(np.isfinite(values), values.astype(object), None).tolist()
+    found = values.astype(object)
+    found[~np.isfinite(values)] = None
+    return found.tolist()
 
 
 def _corners(args: argparse.Namespace) -> npt.NDArray[np.float64] | None:

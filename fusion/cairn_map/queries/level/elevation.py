@@ -129,8 +129,20 @@ def elevation_of(
     step_mm = geometry.voxel_height_um / 1e3
     height, variance = np.full(H * W, np.nan), np.full(H * W, np.nan)
     count, obstacle = np.zeros(H * W, np.int64), np.zeros(H * W)
-    voxels = (each[order] for each in (columns, numbers[:, 2], votes, offsets, hits, occupied))
-    columns_into(*voxels, step_mm, clearance_m * 1e3, height, variance, count, obstacle)
+    columns_into(
+        columns[order],
+        numbers[order, 2],
+        votes[order],
+        offsets[order],
+        hits[order],
+        occupied[order],
+        step_mm,
+        clearance_m * 1e3,
+        height,
+        variance,
+        count,
+        obstacle,
+    )
     # Stage 3: what the neighbours say.
     height_m = height.reshape(H, W) / 1e3
     slope, roughness, step = _around(height_m, geometry.voxel_edge_m)
@@ -156,9 +168,8 @@ def _voxels(
 ) -> tuple[Ints, Ints, Ints, Ints, Flags]:
     """Numbers, votes, sums of offsets in mm, hits and occupancy of the voxels in a box that were hit."""
     planes, step_mm = geometry.planes_of(HEIGHT_OFFSET.name), round(HEIGHT_OFFSET.step)
-    found: list[tuple[Ints, Ints, Ints, Ints, Flags]] = [
-        (np.empty((0, 3), np.int64), *(np.empty(0, np.int64),) * 3, np.empty(0, np.bool_))
-    ]
+    none = np.empty(0, np.int64)
+    found: list[tuple[Ints, Ints, Ints, Ints, Flags]] = [(none.reshape(0, 3), none, none, none, np.empty(0, np.bool_))]
     for key, evidence in cells:
         numbers = voxels_in_cell(evidence.voxels, key, geometry)
         sums = np.zeros((len(evidence), 2), np.int64)
@@ -167,13 +178,12 @@ def _voxels(
         kept = ((numbers >= low) & (numbers < high)).all(axis=1) & ((hits > 0) | (sums[:, 1] > 0))
         occupied = evidence.occupied(model)
         found.append((numbers[kept], sums[kept, 1], sums[kept, 0] * step_mm, hits[kept], occupied[kept]))
-    numbers, votes, offsets, counts, states = zip(*found, strict=True)
     return (
-        np.concatenate(numbers),
-        np.concatenate(votes),
-        np.concatenate(offsets),
-        np.concatenate(counts),
-        np.concatenate(states),
+        np.concatenate([each[0] for each in found]),
+        np.concatenate([each[1] for each in found]),
+        np.concatenate([each[2] for each in found]),
+        np.concatenate([each[3] for each in found]),
+        np.concatenate([each[4] for each in found]),
     )
 
 
@@ -190,10 +200,10 @@ def _around(height_m: Floats, edge_m: float) -> tuple[Floats, Floats, Floats]:
             z = np.where(known, z, 0.0)
             step = np.maximum(step, np.abs(z))
             x, y = dx * edge_m, dy * edge_m
-            for n, each in enumerate((1.0, x, y, x * x, x * y, y * y)):
-                sums[n] += np.where(known, each, 0.0)
-            for n, each in enumerate((z, x * z, y * z, z * z), 6):
-                sums[n] += each
+            for row, factor in enumerate((1.0, x, y, x * x, x * y, y * y)):
+                sums[row] += np.where(known, factor, 0.0)
+            for row, product in enumerate((z, x * z, y * z, z * z), 6):
+                sums[row] += product
     n, sx, sy, sxx, sxy, syy, sz, sxz, syz, szz = sums
     with np.errstate(divide="ignore", invalid="ignore"):
         # About the means; a determinant of 0 has all columns in a line.
