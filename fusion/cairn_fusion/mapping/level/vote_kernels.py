@@ -46,21 +46,17 @@ def column_votes(
     # A return gives at most a vote or a top and the 63 crossed bins of its column; the array grows with them.
     room = N // 4 + 2 * CROSSED_BINS
     found, offsets, is_hit, count = np.empty((room, 3), np.int64), np.empty(room, np.int64), np.empty(room, np.bool_), 0
-    heights = np.empty(64, np.int64)
-    start = 0
+    heights, start = np.empty(N, np.int64), 0
     while start < N:
         # Stage 1: the returns of one column, from below.
         stop = start + 1
         while stop < N and numbers[order[stop]] == numbers[order[start]]:
             stop += 1
         K = stop - start
-        if len(heights) < K:
-            heights = np.empty(2 * K, np.int64)
         for n in range(K):
             heights[n] = np.int64(np.rint(points_m[order[start + n], 2] * NANOMETRES))
         _sort_into(heights[:K])
-        first = order[start]
-        x, y, lowest = voxels[first, 0], voxels[first, 1], heights[0] // step_nm
+        x, y, lowest = voxels[order[start], 0], voxels[order[start], 1], heights[0] // step_nm
         if count + 2 * K + CROSSED_BINS > len(offsets):
             found, offsets, is_hit = _grown(found, offsets, is_hit, 2 * (len(offsets) + K))
         # Stage 2: bins that beams crossed, as bits from the lowest return's on: above the reach of a vote there, and
