@@ -113,11 +113,11 @@ MAY_NAME = {
 ROOMS = {
     "cairn_map": """
         errors arrays progress machine_memory machine_clocks
-        kernels evidence epochs codec.octree codec.entropy codec commits wire files queries render
+        kernels evidence epochs codec.octree codec.entropy codec commits wire files queries.level queries render
         warm_up
     """,
     "cairn_calib": "rig board board.discs exchange corner_search solve diagnosis report thermal verify cli",
-    "cairn_fusion": "recording clouds ros transfer mapping image_fusion view importers warm_up",
+    "cairn_fusion": "recording clouds ros transfer mapping.level mapping image_fusion view importers warm_up",
     "cairn_client": "replica sync http relay robot folders publish live cli cli.doctor cli.maps cli.robots main",
     "cairn_sim": "scene render robots evaluation experiment study demo sim_command warm_up",
     "cairn_server": """

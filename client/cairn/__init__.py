@@ -42,9 +42,10 @@ if TYPE_CHECKING:
         NotFoundError,
         UnreachableError,
     )
-    from cairn_map.evidence.grid import Geometry, geometry_for
+    from cairn_map.evidence.grid import Geometry, geometry_for, level_geometry
     from cairn_map.evidence.inverse_sensor_model import SensorModel
     from cairn_map.queries.layered_snapshot import LayeredSnapshot
+    from cairn_map.queries.level.elevation import Elevation, Vehicle
     from cairn_map.queries.map_snapshot import MapSnapshot
     from cairn_map.queries.mark_groups import MarkGroup, group_marks
     from cairn_map.queries.occupancy_states import State
@@ -60,6 +61,7 @@ __all__ = [
     "ConflictError",
     "DamagedDataError",
     "DeniedError",
+    "Elevation",
     "Event",
     "Geometry",
     "LayeredRobot",
@@ -83,9 +85,11 @@ __all__ = [
     "State",
     "SyncFailed",
     "UnreachableError",
+    "Vehicle",
     "geometry_for",
     "group_marks",
     "kelvin_from_celsius",
+    "level_geometry",
     "load_rig",
     "open_layers",
     "open_map",
@@ -109,9 +113,10 @@ _MODULES = {
     "cairn_map.errors": """
         CairnError BadInputError DeniedError NotFoundError ConflictError DamagedDataError UnreachableError
     """,
-    "cairn_map.evidence.grid": "Geometry geometry_for",
+    "cairn_map.evidence.grid": "Geometry geometry_for level_geometry",
     "cairn_map.evidence.inverse_sensor_model": "SensorModel",
     "cairn_map.queries.layered_snapshot": "LayeredSnapshot",
+    "cairn_map.queries.level.elevation": "Elevation Vehicle",
     "cairn_map.queries.map_snapshot": "MapSnapshot",
     "cairn_map.queries.mark_groups": "MarkGroup group_marks",
     "cairn_map.queries.occupancy_states": "State",

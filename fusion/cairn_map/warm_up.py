@@ -34,7 +34,7 @@ from cairn_map.evidence.evidence import (
 from cairn_map.evidence.evidence_kernels import channel_above
 from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.fingerprint import fingerprint
-from cairn_map.evidence.grid import BRICK_DEPTH, CellKey, Geometry, cell_key, voxels_in_cell
+from cairn_map.evidence.grid import BRICK_DEPTH, CellKey, Geometry, cell_key, level_geometry, voxels_in_cell
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.kernels.numba_runtime import report_compiling
 from cairn_map.queries.frozen_map import FreezableMap
@@ -201,6 +201,7 @@ def _ask(whole: FreezableMap) -> None:
     snapshot.nearest_unknown(points, radius_m=1)
     snapshot.frontier()
     snapshot.height_map()
+    snapshot_of(EvidenceMap(level_geometry())).elevation()
     with suppress(NotFoundError):
         snapshot.grounds()
     snapshot.floor_grid(ground_m=0.0)

@@ -96,13 +96,13 @@ class Maps:
         """Extent, sizes and head of a map."""
         with self._store.snapshot(row) as snapshot:
             totals, head = snapshot.totals(), snapshot.head
-        edge_m = row.geometry.cell_edge_m
+        x_m, y_m, z_m = row.geometry.cell_edges_m
         box_m = None
         if totals.corner_cells:
             low, high = totals.corner_cells
             box_m = (
-                (low[0] * edge_m, low[1] * edge_m, low[2] * edge_m),
-                ((high[0] + 1) * edge_m, (high[1] + 1) * edge_m, (high[2] + 1) * edge_m),
+                (low[0] * x_m, low[1] * y_m, low[2] * z_m),
+                ((high[0] + 1) * x_m, (high[1] + 1) * y_m, (high[2] + 1) * z_m),
             )
         return MapInfo(
             name=row.name,

@@ -8,6 +8,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 import numpy.typing as npt
+from tests.bench.level import level_rows
 from tests.bench.timing import cpu_s, wall_s
 
 from cairn_calib.rig.lidar import SpinningLidar
@@ -20,7 +21,7 @@ from cairn_fusion.recording.recording_writer import RecordingWriter
 from cairn_fusion.recording.scan import Scan
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.evidence_map import EvidenceMap
-from cairn_map.evidence.grid import CellKey, Geometry, geometry_for
+from cairn_map.evidence.grid import CellKey, Geometry, geometry_for, level_geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_sim.evaluation.scores import FREE, Scores, map_states, scores_of
 from cairn_sim.evaluation.truth_grid import Truth, box_of_cell, truths_of
@@ -64,6 +65,7 @@ def integration_rows(smoke: bool) -> Iterator[Row]:
     yield from _sweep_rows(smoke)
     yield from _rgbd_rows(smoke)
     if not smoke:
+        yield from level_rows()
         yield from _all_cameras_rows(plan)
         yield from _truth_rows(plan, scans)
         yield from _path_rows(plan)
@@ -166,7 +168,11 @@ def _sweep_rows(smoke: bool) -> Iterator[Row]:
     geometry, limits = geometry_for(voxel_edge_m=0.2, channels=()), Integrator(max_range_m=80.0)
     for name, scan in (("image", image), ("points", replace(image, points_m=points))):
         seconds = cpu_s(lambda scan=scan: integrate_scans([scan], rig, geometry, integrator=limits), 1 if smoke else 7)
-        yield f"sweep of 64 beams, {range_m.size} points, 80 m, 20 cm, {name}", f"{seconds:.2f}", "s CPU"
+        yield f"sweep of 64 beams, {range_m.size} points, 80 m, 20 cm, {name}", f"{1e3 * seconds:.1f}", "ms CPU"
+        level_s = cpu_s(
+            lambda scan=scan: integrate_scans([scan], rig, level_geometry(), integrator=limits), 1 if smoke else 7
+        )
+        yield "  into a level of 20 cm and 5 cm", f"{1e3 * level_s:.1f}", f"ms CPU, {level_s / seconds:.2f} x"
 
 
 def _rgbd_rows(smoke: bool) -> Iterator[Row]:

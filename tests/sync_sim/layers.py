@@ -7,7 +7,7 @@ from tests.fixtures.map.classed import CLASSED
 from tests.sync_sim.server import SimServer
 
 from cairn_map.epochs.layer import LayerDefinition, MapLayer
-from cairn_map.evidence.grid import Geometry
+from cairn_map.evidence.grid import Geometry, level_geometry
 from cairn_map.wire.layer_messages import AddLayer
 from cairn_server.access.auth import Caller, Role
 
@@ -22,6 +22,7 @@ DEFINITIONS = (
         )
         for edge_um in (10_000, 20_000, 200_000)
     ),
+    LayerDefinition(name="ground", geometry=level_geometry(), epoch_s=120),
 )
 """One for each name: servers that are joined may define the same one, each by a commit of its own."""
 Layers = dict[str, MapLayer]

@@ -7,15 +7,19 @@
     layer                    voxel     cell  cells      size  URL
     evidence                  4 cm   5.12 m     56   12.4 MB  http://127.0.0.1:8750/maps/lab
     fine                      1 cm   1.28 m      0       0 B  http://127.0.0.1:8750/maps/lab.fine
-
+    $ cairn map layer add http://127.0.0.1:8750/maps/lab ground --kind level
+    layer ground of map lab: voxels of 20 cm and 5 cm height, cells of 12.8 m, channels height, epochs of 120 s
+    robots map into it at http://127.0.0.1:8750/maps/lab.ground
     $ cairn map layer add http://127.0.0.1:8750/maps/lab things --voxel 0.05 --classes wall,floor,chair
     layer things of map lab: voxels of 5 cm, cells of 3.2 m, channels classes, epochs of 120 s
     classes wall, floor, chair, other
 
 A map begins with one layer, `evidence`, and has at most 16. Each is pushed to, fetched, queried, drawn and exported
 under its own URL, by every command that takes a map's: MAP.LAYER. Robots' names, tokens, marks and the sensor model are
-those of the map. A definition is a commit: relays carry it, and it never changes; another definition under the same
-name is refused (`other_layer`), also on a server that is joined later. It takes an operator's token to add one.
+those of the map. A layer of the kind level is the ground outdoors: each scan votes for the heights of surfaces, and
+`cairn map query MAP.LAYER elevation` reads them, with slopes, steps and what is in the way. A definition is a commit:
+relays carry it, and it never changes; another definition under the same name is refused (`other_layer`), also on a
+server that is joined later. It takes an operator's token to add one.
 
 A layer with --classes counts what label images show (RECORDING.md; `labels` of a scan): names of at most 63 classes,
 by commas or one a line in a file, to which `other` is added. They are fixed with the layer: more are another layer.
@@ -40,11 +44,14 @@ from cairn_client.cli.arguments import (
     shown_bytes,
     shown_length,
 )
+from cairn_map.epochs.layer import EVIDENCE
 from cairn_map.errors import BadInputError, first_error
 from cairn_map.evidence.channels import Channel, classes_channel
-from cairn_map.evidence.grid import geometry_for
+from cairn_map.evidence.grid import LEVEL_EDGE_M, LEVEL_STEP_M, Geometry, geometry_for, level_geometry
 from cairn_map.wire.layer_messages import AddLayer, LayerInfo
 
+LEVEL = "level"
+"""Kind of a layer whose voxels are flat, as `--kind` names it."""
 CLASSES_TEXT_MAX = 1 << 16
 """Characters of a file of classes that are read."""
 CLASS_NAMES = re.compile(r"[a-z0-9_,]+")
@@ -63,7 +70,11 @@ def add_parser(commands: Subparsers) -> None:
 def _add_add(commands: Subparsers) -> None:
     add = add_map_parser(commands, "add", _add, text="add a layer to a map; takes an operator's token")
     add.add_argument("name", help="its name: a letter, then a-z, 0-9 and _, at most 32")
-    add.add_argument("--voxel", type=float, required=True, metavar="METRES", help="voxel edge, 0.001 to 1")
+    add.add_argument("--kind", choices=(EVIDENCE, LEVEL), default=EVIDENCE, help="level: heights of surfaces alone")
+    add.add_argument(
+        "--voxel", type=float, metavar="METRES", help=f"voxel edge, 0.001 to 1; needed but for a level ({LEVEL_EDGE_M})"
+    )
+    add.add_argument("--height-step", type=float, metavar="METRES", help=f"height of a level's voxels ({LEVEL_STEP_M})")
     add.add_argument("--channels", help="colour,intensity,temperature, scalars as NAME:UNIT:STEP (those of the map)")
     add.add_argument("--classes", metavar="NAMES|FILE", help="names of classes that label images show, at most 63")
     add.add_argument("--epoch", metavar=f"SECONDS|{NO_EPOCHS}", help=f"{EPOCH_HELP} (that of the map)")
@@ -79,11 +90,7 @@ def _add(args: argparse.Namespace) -> int:
     api, name = api_of(args.map, args.token)
     with api:
         info = api.map_info(name)
-        if args.classes is not None:
-            channels = (*channels_from_text(args.channels or ""), classes_from_text(args.classes))
-        else:
-            channels = info.geometry.channels if args.channels is None else channels_from_text(args.channels)
-        geometry = geometry_for(voxel_edge_m=args.voxel, channels=channels)
+        geometry = _level_geometry(args) if args.kind == LEVEL else _cubes(args, info.geometry)
         epoch_s = epoch_s_from_text(args.epoch, otherwise=info.epoch_s)
         try:
             request = AddLayer(name=args.name, geometry=geometry, epoch_s=epoch_s)
@@ -97,7 +104,7 @@ def _add(args: argparse.Namespace) -> int:
     names = ", ".join(channel.name for channel in layer.geometry.channels) or "none but occupancy"
     epochs = "" if layer.epoch_s is None else f", epochs of {layer.epoch_s} s"
     say(
-        f"layer {layer.name} of map {name}: voxels of {shown_length(layer.geometry.voxel_edge_m)}, "
+        f"layer {layer.name} of map {name}: voxels of {_voxel(layer.geometry)}, "
         f"cells of {layer.geometry.cell_edge_m:g} m, channels {names}{epochs}"
     )
     for channel in layer.geometry.channels:
@@ -105,6 +112,29 @@ def _add(args: argparse.Namespace) -> int:
             say(f"classes {', '.join(channel.classes)}")
     say(f"robots map into it at {_url(args.map, name, layer)}")
     return 0
+
+
+def _cubes(args: argparse.Namespace, of_map: Geometry) -> Geometry:
+    if args.height_step is not None or args.voxel is None:
+        raise BadInputError("bad_option", "a layer needs --voxel METRES; --height-step goes with --kind level")
+    channels = of_map.channels if args.channels is None else channels_from_text(args.channels)
+    if args.classes is not None:
+        channels = (*(channels if args.channels else ()), classes_from_text(args.classes))
+    return geometry_for(voxel_edge_m=args.voxel, channels=channels)
+
+
+def _level_geometry(args: argparse.Namespace) -> Geometry:
+    if args.channels is not None or args.classes is not None:
+        raise BadInputError("bad_option", "a level has one channel, the height; leave out --channels and --classes")
+    edge_m = LEVEL_EDGE_M if args.voxel is None else args.voxel
+    step_m = LEVEL_STEP_M if args.height_step is None else args.height_step
+    return level_geometry(voxel_edge_m=edge_m, height_step_m=step_m)
+
+
+def _voxel(geometry: Geometry) -> str:
+    """Such as `1 cm`, or `20 cm and 5 cm height`."""
+    edge = shown_length(geometry.voxel_edge_m)
+    return f"{edge} and {shown_length(geometry.voxel_height_m)} height" if geometry.is_flat else edge
 
 
 def _list(args: argparse.Namespace) -> int:
@@ -116,7 +146,8 @@ def _list(args: argparse.Namespace) -> int:
         return 0
     say(f"{'layer':<20} {'voxel':>9} {'cell':>8} {'cells':>6} {'size':>9}  URL")
     for layer in layers:
-        voxel, size = shown_length(layer.geometry.voxel_edge_m), shown_bytes(layer.size_bytes)
+        edge, size = shown_length(layer.geometry.voxel_edge_m), shown_bytes(layer.size_bytes)
+        voxel = f"{edge} flat" if layer.geometry.is_flat else edge
         cell = f"{layer.geometry.cell_edge_m:g} m"
         url = _url(args.map, name, layer)
         say(f"{layer.name:<20} {voxel:>9} {cell:>8} {layer.cells:>6} {size:>9}  {url}")

@@ -56,7 +56,8 @@ def along_ray(origin: Sequence[float], direction: Sequence[float], *, range_m: f
 
 def needed_cells(keys: Sequence[CellKey], needs: Needs, geometry: Geometry) -> list[CellKey]:
     """Those of the cells that a question needs, in their order."""
-    low_m = cells_of_keys(np.array(keys, np.uint64)).astype(np.float64) * geometry.cell_edge_m
+    edges_m = np.array(geometry.cell_edges_m)
+    low_m = cells_of_keys(np.array(keys, np.uint64)).astype(np.float64) * edges_m
     margin_m = geometry.voxel_edge_m
-    are_needed = needs(low_m - np.float64(margin_m), low_m + np.float64(geometry.cell_edge_m + margin_m))
+    are_needed = needs(low_m - np.float64(margin_m), low_m + (edges_m + margin_m))
     return [key for key, is_needed in zip(keys, are_needed.tolist(), strict=True) if is_needed]

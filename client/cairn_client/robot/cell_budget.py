@@ -262,9 +262,9 @@ class CellBudget:
     def _centre(self) -> Ints:
         """The robot's cell, else the last centre, else the middle of the cells that are held; within the scope."""
         place = self._place()
-        edge_m = self._replica.geometry.cell_edge_m
+        edges_m = self._replica.geometry.cell_edges_m
         if place is not None:
-            centre = np.floor(np.array(place) / edge_m).astype(np.int64)
+            centre = np.floor(np.array(place) / edges_m).astype(np.int64)
         elif self.kept is not None:
             centre = np.array(self.kept.centre, np.int64)
         else:

@@ -155,7 +155,7 @@ class Rounds:
         self._branch = replica.author.robot
         self._link = Link(api, map_name, branch=self._branch, has_epochs=lambda: replica.layer.has_epochs)
         # Cells that are held at all, by the limits; then the reports, and the lock that lets one round pass at a time.
-        scope_box = scope.box(replica.geometry.cell_edge_m)
+        scope_box = scope.box(replica.geometry.cell_edges_m)
         self._budget = CellBudget(replica, limits, events, place=status.place, scope_box=scope_box)
         self._watch = RoundWatch(replica, events)
         self._lock = threading.Lock()
@@ -278,7 +278,7 @@ class Rounds:
         """Fetch the cells that fit: again with a smaller box when there is no room for them."""
         # The box of cells that fit goes with the robot, and is made smaller until its cells do fit.
         is_low_end, place = self._mode == "low-end", self._status.place()
-        near = cell_at(place, self._replica.geometry.cell_edge_m) if place is not None else None
+        near = cell_at(place, self._replica.geometry.cell_edges_m) if place is not None else None
         self._link.hold(self._budget.keep_up())
         while True:
             box = self._budget.box()

@@ -14,21 +14,22 @@ Wanted = Callable[[Cell], bool]
 """True for a cell that a low-end robot keeps."""
 
 
-def within(position_m: npt.ArrayLike, *, radius_m: float, cell_edge_m: float) -> Wanted:
-    """Cells of which some point lies within a radius of a position."""
-    centre = np.asarray(position_m, dtype=np.float64)
+def within(position_m: npt.ArrayLike, *, radius_m: float, cell_edges_m: npt.ArrayLike) -> Wanted:
+    """Cells, of edges along x, y and z, of which some point lies within a radius of a position."""
+    centre, edges_m = np.asarray(position_m, dtype=np.float64), np.asarray(cell_edges_m, dtype=np.float64)
 
     def is_near(cell: Cell) -> bool:
-        low = np.array(cell) * cell_edge_m
-        nearest = np.clip(centre, low, low + cell_edge_m)
+        low = np.array(cell) * edges_m
+        nearest = np.clip(centre, low, low + edges_m)
         return bool(np.linalg.norm(nearest - centre) <= radius_m)
 
     return is_near
 
 
-def cell_at(position_m: Sequence[float], cell_edge_m: float) -> Cell:
-    """The cell that holds a position in the map's frame, or the outermost one in that direction."""
-    return Cell(*(max(-CELL_LIMIT, min(CELL_LIMIT - 1, math.floor(value / cell_edge_m))) for value in position_m))
+def cell_at(position_m: Sequence[float], cell_edges_m: Sequence[float]) -> Cell:
+    """The cell, of edges along x, y and z, that holds a position, or the outermost one in that direction."""
+    numbers = (math.floor(value / edge_m) for value, edge_m in zip(position_m, cell_edges_m, strict=True))
+    return Cell(*(max(-CELL_LIMIT, min(CELL_LIMIT - 1, number)) for number in numbers))
 
 
 def in_order(listed: IndexedCells, near: Cell | None) -> npt.NDArray[np.uint64]:

@@ -1,6 +1,7 @@
 """Scope of a robot's fetches: the cells that it wants, and how many bytes come in one reply and one round."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from cairn_client.replica.replica import Replica
@@ -40,13 +41,13 @@ class Scope:
             if size_bytes is not None and size_bytes < 1:
                 raise BadInputError("bad_option", f"a reply and a round have at least 1 byte, got {size_bytes}")
 
-    def box(self, cell_edge_m: float) -> Box | None:
-        """The box as cells, lowest and highest, both included."""
+    def box(self, cell_edges_m: Sequence[float]) -> Box | None:
+        """The box as cells, of edges along x, y and z, lowest and highest, both included."""
         if self.box_m is None:
             return None
-        low, high = self.box_m
-        first = Cell(*(_number(math.floor(_cells(value, cell_edge_m))) for value in low))
-        last = Cell(*(_number(math.ceil(_cells(value, cell_edge_m)) - 1) for value in high))
+        low, high = (zip(corner, cell_edges_m, strict=True) for corner in self.box_m)
+        first = Cell(*(_number(math.floor(_cells(value, edge_m))) for value, edge_m in low))
+        last = Cell(*(_number(math.ceil(_cells(value, edge_m)) - 1) for value, edge_m in high))
         return first, last
 
 
@@ -64,7 +65,7 @@ def fetch(
         UnreachableError: the link broke; what came is kept.
         DamagedDataError: the server's answer is not sound.
     """
-    box = within or scope.box(replica.geometry.cell_edge_m)
+    box = within or scope.box(replica.geometry.cell_edges_m)
     wanted = scope.wanted
 
     def is_in_scope(cell: Cell) -> bool:

@@ -5,6 +5,7 @@
     votes    classes of label images, one vote for each voxel and camera         `class_votes`
     counts   hits where beams ended, misses where the image looks through       `free_space`, `brick_tally`
              for lidars, ray by ray                                             `ray_casting`
+             in a level layer: a vote for each column and surface               `level.votes`
     pack     evidence by cell
 
 Inverse sensor model: one count per voxel and scan, and a hit wins over a miss. The result depends on the scans alone,
@@ -30,6 +31,7 @@ from cairn_fusion.mapping.beam_returns import ReturnCounts, Returns, clear_image
 from cairn_fusion.mapping.brick_tally import Each, TallyPool
 from cairn_fusion.mapping.class_votes import ClassVotes, classes_of_labels
 from cairn_fusion.mapping.free_space import Window, carving_of, window_of
+from cairn_fusion.mapping.level.votes import votes_of
 from cairn_fusion.mapping.ray_casting import beam_evidence, carried, clear_ends, silent_ends
 from cairn_fusion.mapping.samples import ImageTransfers, SampleLimits, sample_sums
 from cairn_fusion.recording.scan import Scan, check_scan
@@ -163,7 +165,9 @@ class Integration:
         # Stage 2: named readings and labels, checked before anything is counted.
         scalars, classes = _scalar_evidence(scan, self._geometry), classes_of_labels(scan, self._geometry)
         # Stage 3: hits, samples and misses.
-        if window is None:
+        if self._geometry.is_flat:
+            self._tallies.merge(votes_of(returns.T_map_tof[:3, 3], returns.points_map, self._geometry))
+        elif window is None:
             self._cast(scan, returns)
         elif returns.reach_m > 0:
             self._carve(scan, returns, window)
@@ -212,11 +216,14 @@ class Integration:
         if self._rig.body is not None and T_map_body is not None:
             T_body_sensor = inverse(check_transform(T_map_body, name="T_map_body")) @ T
             kept &= ~self._rig.body.holds(transform_points(T_body_sensor, own))
-        # Clear up to a margin before each point, by its noise.
-        sigma_m = LIDAR.sigma_at(range_m[kept], usual=LIDAR) if of is None else of.range_sigma_m(range_m[kept])
         points_map = carried(own[kept], T)
-        clear_m = self._clear_ends(T[:3, 3], points_map, sigma_m)
-        self._tallies.merge(beam_evidence(T[:3, 3], points_map, clear_m, self._geometry, sums_of=None))
+        if self._geometry.is_flat:
+            self._tallies.merge(votes_of(T[:3, 3], points_map, self._geometry))
+        else:
+            # Clear up to a margin before each point, by its noise.
+            sigma_m = LIDAR.sigma_at(range_m[kept], usual=LIDAR) if of is None else of.range_sigma_m(range_m[kept])
+            clear_m = self._clear_ends(T[:3, 3], points_map, sigma_m)
+            self._tallies.merge(beam_evidence(T[:3, 3], points_map, clear_m, self._geometry, sums_of=None))
         counts = ReturnCounts(
             used=len(points_map),
             no_return=int(np.count_nonzero(void)),

@@ -18,7 +18,7 @@ from cairn_map.codec.cell_code import EncodedCell, Profile, decode_canonical_cel
 from cairn_map.codec.cell_reading import CELL_BYTES_MAX, EVIDENCE_BYTES_MAX
 from cairn_map.codec.octree.cell_head import (
     FLAG_SIGNED,
-    KIND_EVIDENCE,
+    KNOWN_KINDS,
     MAGIC,
     CellHead,
     channels_from_bytes,
@@ -26,6 +26,9 @@ from cairn_map.codec.octree.cell_head import (
     decode_head,
     encode_head,
     end_of_channels,
+    height_from_bytes,
+    height_to_bytes,
+    kind_of,
 )
 from cairn_map.epochs.cell_history import ROWS_MAX, CellHistory, cell_history
 from cairn_map.epochs.epoch import Epoch, check_epoch
@@ -184,7 +187,7 @@ def _encode_head(key: CellKey, layer: MapLayer, rows: int) -> bytes:
     fixed = FIXED_PART.pack(
         MAGIC,
         VERSION,
-        KIND_EVIDENCE,
+        kind_of(geometry),
         geometry.depth,
         0,
         geometry.voxel_edge_um,
@@ -194,7 +197,7 @@ def _encode_head(key: CellKey, layer: MapLayer, rows: int) -> bytes:
         len(geometry.channels),
         len(name),
     )
-    return fixed + name + channels_to_bytes(geometry)
+    return fixed + name + height_to_bytes(geometry) + channels_to_bytes(geometry)
 
 
 def _decode_head(data: bytes) -> tuple[CellKey, MapLayer, int, int]:
@@ -202,26 +205,30 @@ def _decode_head(data: bytes) -> tuple[CellKey, MapLayer, int, int]:
     if len(data) < FIXED_PART.size or data[:4] != MAGIC:
         raise DamagedDataError("bad_cell", "not a cairn cell: it must begin with CRNC and a whole head")
     _, version, kind, depth, flags, edge_um, i, j, k, epoch_s, rows, channels, name_bytes = FIXED_PART.unpack_from(data)
-    if version != VERSION or kind != KIND_EVIDENCE:
-        raise BadInputError("unknown_version", f"expected a cell of version 2, kind 1; got {version}, {kind}")
+    if version != VERSION or kind not in KNOWN_KINDS:
+        raise BadInputError("unknown_version", f"expected a cell of version 2, kind 1 or 3; got {version}, {kind}")
     if flags & FLAG_EVICTS:
         raise BadInputError("unknown_version", "this reader knows no cells of maps that let old rows go")
     if flags or not all(-CELL_LIMIT <= v < CELL_LIMIT for v in (i, j, k)):
         raise DamagedDataError("bad_cell", "unknown flags, or a cell number out of range")
     at = FIXED_PART.size + name_bytes
     try:
-        end = end_of_channels(data, at, channels)
-        layer = _layer(data[FIXED_PART.size : at], epoch_s, edge_um, depth, channels, data[at:end])
+        step_um, start = height_from_bytes(data, at, kind)
+        end = end_of_channels(data, start, channels)
+        layer = _layer(data[FIXED_PART.size : at], epoch_s, edge_um, step_um, depth, channels, data[start:end])
     except (struct.error, UnicodeDecodeError, ValidationError) as exc:
         raise DamagedDataError("bad_cell", f"the cell's head is damaged: {str(exc).splitlines()[0]}") from exc
-    if channels_to_bytes(layer.geometry) != data[at:end]:
+    if channels_to_bytes(layer.geometry) != data[start:end]:
         raise DamagedDataError("not_canonical", "the cell's head is not in canonical form")
     return cell_key((i, j, k)), layer, rows, end
 
 
 @lru_cache(maxsize=16)
-def _layer(name: bytes, epoch_s: int, edge_um: int, depth: int, channel_count: int, channels: bytes) -> MapLayer:
-    geometry = Geometry(voxel_edge_um=edge_um, depth=depth, channels=channels_from_bytes(channels, channel_count))
+def _layer(
+    name: bytes, epoch_s: int, edge_um: int, step_um: int | None, depth: int, channel_count: int, channels: bytes
+) -> MapLayer:
+    found = channels_from_bytes(channels, channel_count)
+    geometry = Geometry(voxel_edge_um=edge_um, height_step_um=step_um, depth=depth, channels=found)
     return MapLayer(name=name.decode(), geometry=geometry, epoch_s=epoch_s)
 
 

@@ -138,6 +138,10 @@ INTENSITY = Channel(kind=ChannelKind.INTENSITY, name="intensity", unit="counts")
 TEMPERATURE = Channel(kind=ChannelKind.TEMPERATURE, name="temperature", unit="K", step=0.05)
 """0.05 K is the resolution of the paper's thermal cameras."""
 
+HEIGHT_OFFSET = Channel(kind=ChannelKind.SCALAR, name="height", unit="mm", step=5.0)
+"""Height of a surface above its voxel's lower face, in level layers; a sample is a vote of one scan.
+Its step of 5 mm is a tenth of a usual bin, and a layer has a tenth fewer bytes with it than with 1 mm."""
+
 STANDARD_CHANNELS = (COLOUR, INTENSITY, TEMPERATURE)
 
 

@@ -13,15 +13,15 @@ import json
 import re
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Annotated, NamedTuple, NewType, Self
+from typing import Annotated, Any, NamedTuple, NewType, Self
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, FailFast, Field, model_validator
+from pydantic import BaseModel, FailFast, Field, SerializerFunctionWrapHandler, model_serializer, model_validator
 
 from cairn_map.arrays import Ints
 from cairn_map.errors import BadInputError
-from cairn_map.evidence.channels import STANDARD_CHANNELS, Channel, ChannelKind
+from cairn_map.evidence.channels import HEIGHT_OFFSET, STANDARD_CHANNELS, Channel, ChannelKind
 from cairn_map.kernels.morton_kernels import UInts, deinterleave, interleave
 
 CellKey = NewType("CellKey", int)
@@ -36,6 +36,8 @@ DEPTH_MAX = 8
 STANDARD_EDGE_UM, STANDARD_CELL_UM, STANDARD_DEPTH_MAX, STANDARD_SUMS_MAX = 40_000, 5_120_000, 7, 9 << 21
 """Standard voxels' edge; and bounds of standard cells: their edge, their depth, and the sums of samples that a full one
 has, which are those of 128^3 voxels with the standard channels."""
+LEVEL_EDGE_M, LEVEL_STEP_M = 0.2, 0.05
+"""Standard edge and height of a level layer's voxels, metres: of the study that chose how a level is read."""
 CELL_TEXT = re.compile(",".join([r"(0|-?[1-9][0-9]{0,6})"] * 3))
 """The only text of each cell: `int` alone would also take " 1", "+1", "1_0" and other scripts' digits."""
 NANOMETRES = 1e9
@@ -62,11 +64,14 @@ class Geometry(BaseModel, frozen=True, extra="forbid"):
     """Octree depth of a cell, which has 2^depth voxels along an edge. Standard are the largest cells of at most 5.12 m,
     the paper's, and 128^3 voxels; of 64^3 or fewer if the samples have more than 9 planes."""
     channels: Annotated[tuple[Channel, ...], Field(max_length=16), FailFast()] = STANDARD_CHANNELS
+    height_step_um: Annotated[int, Field(ge=1000, le=1_000_000)] | None = None
+    """Height of a flat voxel of a level layer (`queries.level`), micrometres; None: voxels are cubes. A level layer's
+    standard cells are those of at most 5.12 m height."""
 
     @model_validator(mode="after")
     def _with_depth(self) -> Self:
         if "depth" not in self.model_fields_set:
-            object.__setattr__(self, "depth", _standard_depth(self.voxel_edge_um, self.plane_count))
+            object.__setattr__(self, "depth", _standard_depth(self.voxel_height_um, self.plane_count))
         return self
 
     @model_validator(mode="after")
@@ -75,6 +80,24 @@ class Geometry(BaseModel, frozen=True, extra="forbid"):
         if sum(channel.kind is ChannelKind.CLASSES for channel in self.channels) > 1:
             raise ValueError("a map has one channel of classes at most; more classes are another layer")
         return self
+
+    @model_validator(mode="after")
+    def _is_level(self) -> Self:
+        if self.height_step_um is not None and HEIGHT_OFFSET not in self.channels:
+            raise ValueError(
+                f"flat voxels have the channel {HEIGHT_OFFSET.name}, a scalar in mm with steps of 5 from 0"
+            )
+        if self.height_step_um is not None and self.height_step_um > self.voxel_edge_um:
+            raise ValueError(f"a height step is at most the voxel edge, got {self.height_step_um} um")
+        return self
+
+    @model_serializer(mode="wrap")
+    def _without_step(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        # Cubes are stated as they were before voxels could be flat: digests, commits and answers keep their bytes.
+        fields: dict[str, Any] = handler(self)
+        if self.height_step_um is None:
+            fields.pop("height_step_um", None)
+        return fields
 
     @model_validator(mode="after")
     def _names_differ(self) -> Self:
@@ -86,12 +109,28 @@ class Geometry(BaseModel, frozen=True, extra="forbid"):
     def __str__(self) -> str:
         """Such as `voxels of 0.04 m, cells of 128^3, channels colour, temperature`."""
         names = ", ".join(channel.name for channel in self.channels) or "none"
-        return f"voxels of {self.voxel_edge_m:g} m, cells of {self.side}^3, channels {names}"
+        height = f" and {self.voxel_height_m:g} m height" if self.is_flat else ""
+        return f"voxels of {self.voxel_edge_m:g} m{height}, cells of {self.side}^3, channels {names}"
 
     @property
     def voxel_edge_m(self) -> float:
-        """Edge of a voxel, metres."""
+        """Edge of a voxel, metres; of a flat one its horizontal edges."""
         return self.voxel_edge_um / 1e6
+
+    @property
+    def is_flat(self) -> bool:
+        """True if voxels are lower than they are wide: a level layer, read as a surface."""
+        return self.height_step_um is not None
+
+    @property
+    def voxel_height_um(self) -> int:
+        """Height of a voxel, micrometres; of a cube its edge."""
+        return self.voxel_edge_um if self.height_step_um is None else self.height_step_um
+
+    @property
+    def voxel_height_m(self) -> float:
+        """Height of a voxel, metres; of a cube its edge."""
+        return self.voxel_height_um / 1e6
 
     @property
     def side(self) -> int:
@@ -100,8 +139,17 @@ class Geometry(BaseModel, frozen=True, extra="forbid"):
 
     @property
     def cell_edge_m(self) -> float:
-        """Edge of a cell, metres."""
+        """Edge of a cell, metres; of one of flat voxels its horizontal edges."""
         return self.voxel_edge_um * self.side / 1e6
+
+    @property
+    def cell_edges_m(self) -> tuple[float, float, float]:
+        """Edges of a cell along x, y and z, metres; equal but where voxels are flat."""
+        return self.cell_edge_m, self.cell_edge_m, self.voxel_height_um * self.side / 1e6
+
+    def voxel_size_um(self) -> Ints:
+        """(3,) edges of a voxel along x, y and z, micrometres."""
+        return np.array([self.voxel_edge_um, self.voxel_edge_um, self.voxel_height_um], np.int64)
 
     @property
     def plane_count(self) -> int:
@@ -128,12 +176,12 @@ class Geometry(BaseModel, frozen=True, extra="forbid"):
 
     def digest(self) -> bytes:
         """SHA-256 (32 bytes) over the geometry as JSON with sorted keys; two maps can share evidence only if equal."""
-        return _digest(self.voxel_edge_um, self.depth, self.channels)
+        return _digest(self.voxel_edge_um, self.depth, self.channels, self.height_step_um)
 
 
 @lru_cache(maxsize=64)
-def _digest(voxel_edge_um: int, depth: int, channels: tuple[Channel, ...]) -> bytes:
-    geometry = Geometry(voxel_edge_um=voxel_edge_um, depth=depth, channels=channels)
+def _digest(voxel_edge_um: int, depth: int, channels: tuple[Channel, ...], height_step_um: int | None) -> bytes:
+    geometry = Geometry(voxel_edge_um=voxel_edge_um, depth=depth, channels=channels, height_step_um=height_step_um)
     text = json.dumps(geometry.model_dump(mode="json"), sort_keys=True, separators=(",", ":"), ensure_ascii=True)
     return hashlib.sha256(text.encode()).digest()
 
@@ -150,6 +198,36 @@ def geometry_for(*, voxel_edge_m: float, channels: tuple[Channel, ...] = STANDAR
     if not 1000 <= edge_um <= 1_000_000:
         raise BadInputError("bad_geometry", f"voxel edge must be 0.001 to 1 m, got {voxel_edge_m}")
     return Geometry(voxel_edge_um=edge_um, channels=channels)
+
+
+def level_geometry(*, voxel_edge_m: float = LEVEL_EDGE_M, height_step_m: float = LEVEL_STEP_M) -> Geometry:
+    """The geometry of a level layer: flat voxels, their horizontal edge and height in metres, with standard cells.
+
+    Raises:
+        BadInputError: the edge is not 1 mm to 1 m, or the height not 1 mm to the edge.
+    """
+    edge_um, step_um = round(voxel_edge_m * 1e6), round(height_step_m * 1e6)
+    if not 1000 <= step_um <= edge_um <= 1_000_000:
+        raise BadInputError(
+            "bad_geometry",
+            f"a level's voxel edge must be 0.001 to 1 m, and its height step 0.001 m to the edge, "
+            f"got {voxel_edge_m} and {height_step_m}",
+        )
+    return Geometry(voxel_edge_um=edge_um, height_step_um=step_um, channels=(HEIGHT_OFFSET,))
+
+
+def check_cubes(geometry: Geometry) -> None:
+    """Refuse a level layer where a question is about space: it holds surfaces, and hardly anything of what is free.
+
+    Raises:
+        BadInputError: kind `level_layer`.
+    """
+    if geometry.is_flat:
+        raise BadInputError(
+            "level_layer",
+            "this layer is a level: it answers points, slices, height maps and elevation. For rays, obstacles, free "
+            "space and pictures ask a layer of cubic voxels",
+        )
 
 
 def _standard_depth(edge_um: int, planes: int) -> int:
@@ -219,10 +297,10 @@ def voxels_of_points(points_m: npt.NDArray[np.floating], geometry: Geometry) -> 
         BadInputError: a point lies outside the numbered space or is not finite.
     """
     points = np.asarray(points_m, dtype=np.float64).reshape(-1, 3)
-    reach_m = (CELL_LIMIT - 1) * geometry.cell_edge_m
+    reach_m = (CELL_LIMIT - 1) * geometry.cell_edges_m[2]  # the least of the three
     if not (np.abs(points) < reach_m).all():  # also catches NaN
         raise BadInputError("point_range", f"points must be finite and within {reach_m:.0f} m of the origin")
-    voxels: Ints = np.rint(points * NANOMETRES).astype(np.int64) // (geometry.voxel_edge_um * 1000)
+    voxels: Ints = np.rint(points * NANOMETRES).astype(np.int64) // (geometry.voxel_size_um() * 1000)
     return voxels
 
 
@@ -241,4 +319,4 @@ def voxels_in_cell(places: npt.NDArray[np.uint32], key: int, geometry: Geometry)
 
 def centres_of_voxels(voxels: Ints, geometry: Geometry) -> npt.NDArray[np.float64]:
     """(N, 3) float64 centres in metres, map frame, of (N, 3) voxel numbers."""
-    return np.asarray((voxels * 2 + 1) * (geometry.voxel_edge_um / 2e6), dtype=np.float64)
+    return np.asarray((voxels * 2 + 1) * (geometry.voxel_size_um() / 2e6), dtype=np.float64)

@@ -16,7 +16,7 @@ from cairn_map.arrays import Floats
 from cairn_map.epochs.moment import TimeText
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.evidence import Evidence
-from cairn_map.evidence.grid import CellKey, Geometry, cell_of_key, centres_of_voxels, voxels_in_cell
+from cairn_map.evidence.grid import CellKey, Geometry, cell_of_key, centres_of_voxels, check_cubes, voxels_in_cell
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.evidence.view import Chance, Colours, View, ViewStyle, view_of
 
@@ -99,8 +99,10 @@ class ExportRequest(BaseModel):
         """The nodes' octree depth.
 
         Raises:
-            BadInputError: kind `bad_style`: deeper than the map's cells.
+            BadInputError: kind `bad_style`: deeper than the map's cells; `level_layer`: an octree of flat voxels.
         """
+        if self.format in ("ot", "bt"):
+            check_cubes(geometry)
         if self.depth is not None and self.depth > geometry.depth:
             raise BadInputError("bad_style", f"depth must be 1 to {geometry.depth} on this map, got {self.depth}")
         return geometry.depth if self.depth is None else self.depth
@@ -178,15 +180,17 @@ def chosen_places(
 def cell_may_have(key: CellKey, geometry: Geometry, asked: ExportRequest) -> bool:
     """True if a cell reaches into the box of a request."""
     low, high = asked.bounds_m()
-    corner = np.array(cell_of_key(key)) * geometry.cell_edge_m
-    return bool((corner <= high).all() and (corner + geometry.cell_edge_m >= low).all())
+    corner, edges_m = np.array(cell_of_key(key)) * geometry.cell_edges_m, np.array(geometry.cell_edges_m)
+    return bool((corner <= high).all() and (corner + edges_m >= low).all())
 
 
 def node_geometry(geometry: Geometry, asked: ExportRequest) -> Geometry:
     """The map's geometry with the nodes of the requested depth as its voxels."""
     depth = asked.depth_in(geometry)
-    edge_um = geometry.voxel_edge_um << (geometry.depth - depth)
-    return geometry.model_copy(update={"depth": depth, "voxel_edge_um": edge_um})
+    coarser = geometry.depth - depth
+    step_um = None if geometry.height_step_um is None else geometry.height_step_um << coarser
+    edges = {"voxel_edge_um": geometry.voxel_edge_um << coarser, "height_step_um": step_um}
+    return geometry.model_copy(update={"depth": depth, **edges})
 
 
 def _chosen(

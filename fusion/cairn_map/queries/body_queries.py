@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
+from cairn_map.evidence.grid import check_cubes
 from cairn_map.queries import body_kernels as kernels
 from cairn_map.queries.frozen_map import FrozenMap, as_points, check_within
 from cairn_map.queries.occupancy_states import State
@@ -93,6 +94,7 @@ def check_sphere(frozen: FrozenMap, centres_m: npt.ArrayLike, *, radius_m: float
 
 
 def _check(frozen: FrozenMap, centres_m: Floats, R: Floats, *, half_m: Floats, radius_m: float) -> PathStates:
+    check_cubes(frozen.geometry)
     edge_m = frozen.geometry.voxel_edge_m
     if max(half_m.max(), radius_m) * 2 > SIZE_MAX_CELLS * frozen.geometry.cell_edge_m:
         raise BadInputError("too_large", f"a body is at most {SIZE_MAX_CELLS} cells long")

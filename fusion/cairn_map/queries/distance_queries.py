@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
+from cairn_map.evidence.grid import check_cubes
 from cairn_map.queries.frozen_map import FrozenMap, as_points, check_within
 from cairn_map.queries.nearest_kernels import nearest_into
 from cairn_map.queries.occupancy_states import State
@@ -56,6 +57,7 @@ def cast(
     ends_in_unknown: bool,
 ) -> RayEnds:
     """Ends of N rays, from N origins, or one, along N directions, or one, of any length other than 0."""
+    check_cubes(frozen.geometry)
     origins, directions = _as_many(_rows(origins_m, "origins"), _rows(directions, "directions"))
     if not max_range_m >= 0:
         raise BadInputError("bad_range", f"the maximum range must be 0 or more, got {max_range_m}")
@@ -143,6 +145,7 @@ class Nearest:
 
 def nearest(frozen: FrozenMap, points_m: npt.ArrayLike, state: State, *, radius_m: float) -> Nearest:
     """The nearest voxels in a state, OCCUPIED or UNKNOWN, of (N, 3) points."""
+    check_cubes(frozen.geometry)
     points = as_points(points_m, "points")
     if not 0 <= radius_m < np.inf:
         raise BadInputError("bad_range", f"a radius must be finite and 0 or more, got {radius_m}")

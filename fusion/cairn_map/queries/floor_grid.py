@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_map.errors import BadInputError, NotFoundError
-from cairn_map.evidence.grid import NANOMETRES
+from cairn_map.evidence.grid import NANOMETRES, check_cubes
 from cairn_map.queries import floor_kernels as kernels
 from cairn_map.queries.frozen_map import Box, FrozenMap
 from cairn_map.queries.region_queries import check_pixels
@@ -70,6 +70,7 @@ def floor_grid(frozen: FrozenMap, ground_m: float, band_m: Band | None, box_m: B
     Raises:
         BadInputError: kind `bad_band`; `point_range`: the ground is beyond the numbered space; `bad_box`; `too_large`.
     """
+    check_cubes(frozen.geometry)
     edge_m = frozen.geometry.voxel_edge_m
     band_m = _checked_band(band_m, edge_m)
     if not abs(ground_m) + band_m[1] < frozen.reach_m:
@@ -96,6 +97,7 @@ def grounds(frozen: FrozenMap, band_m: Band | None) -> list[tuple[float, float]]
         BadInputError: kind `bad_band`.
         NotFoundError: kind `no_ground`: no column is free at any height.
     """
+    check_cubes(frozen.geometry)
     edge_m = frozen.geometry.voxel_edge_m
     band_m = _checked_band(band_m, edge_m)
     bottom = int(frozen.grid.low[2])

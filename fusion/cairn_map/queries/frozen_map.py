@@ -64,6 +64,15 @@ class FrozenMap:
         """Points must be nearer to the origin than this along every axis."""
         return (CELL_LIMIT - 1) * self.geometry.cell_edge_m
 
+    def on_lattice(self, points_m: Floats) -> Floats:
+        """(N, 3) points, of which the heights are stretched where voxels are flat, so that kernels see cubes."""
+        geometry = self.geometry
+        if not geometry.is_flat:
+            return points_m
+        points = points_m.copy()
+        points[:, 2] *= geometry.voxel_edge_um / geometry.voxel_height_um
+        return points
+
     @property
     def size_bytes(self) -> int:
         """Memory held besides the cells, which it shares with the live map."""
@@ -91,7 +100,7 @@ class FrozenMap:
         box = np.asarray(box_m, np.float64)
         if box.shape != (2, 3) or not (box[0] <= box[1]).all():
             raise BadInputError("bad_box", f"a box is its lowest and its highest corner, (2, 3) metres; got {box_m!r}")
-        edge_nm = self.grid.edge_nm
+        box, edge_nm = self.on_lattice(box), self.grid.edge_nm
         limit_nm = self.reach_m * NANOMETRES
         nanometres = np.rint(np.clip(box * NANOMETRES, -limit_nm, limit_nm)).astype(np.int64)
         # The first centre, edge / 2 above a voxel's border, that is not below the corner.

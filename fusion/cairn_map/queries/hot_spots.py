@@ -21,7 +21,16 @@ from cairn_map.arrays import Flags, Floats, Int32s, Ints, Words32
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.evidence import Evidence
-from cairn_map.evidence.grid import CELL_LIMIT, Cell, CellKey, Geometry, cell_of_key, centres_of_voxels, voxels_in_cell
+from cairn_map.evidence.grid import (
+    CELL_LIMIT,
+    Cell,
+    CellKey,
+    Geometry,
+    cell_of_key,
+    centres_of_voxels,
+    check_cubes,
+    voxels_in_cell,
+)
 from cairn_map.evidence.inverse_sensor_model import SensorModel, log_odds
 from cairn_map.evidence.voxels import reading_of_sums
 from cairn_map.queries.frozen_map import Box, FrozenMap
@@ -115,8 +124,9 @@ def spots_of_map(frozen: FrozenMap, *, over_k: float, voxels_min: int, box_m: Bo
     """Hot spots of a frozen map, ranked.
 
     Raises:
-        BadInputError: kind `unknown_channel`: the map has no temperatures; `bad_box`; `too_costly`.
+        BadInputError: kind `unknown_channel`: the map has no temperatures; `bad_box`; `too_costly`; `level_layer`.
     """
+    check_cubes(frozen.geometry)
     geometry, model = frozen.geometry, frozen.model
     channel = first_of_kind(geometry, ChannelKind.TEMPERATURE)
     frozen.voxels_of_box(box_m)

@@ -36,6 +36,7 @@ from cairn_map.queries.distance_queries import Nearest, RayEnds
 from cairn_map.queries.floor_grid import Band, FloorGrid
 from cairn_map.queries.frozen_map import Box, FreezableMap, FrozenMap, freeze
 from cairn_map.queries.hot_spots import Spots
+from cairn_map.queries.level.elevation import CLEARANCE_M, Elevation
 from cairn_map.queries.occupancy_states import State
 from cairn_map.queries.region_queries import MapImage
 
@@ -234,6 +235,18 @@ class MapSnapshot:
             BadInputError: kind `too_large`: more than 67 million pixels.
         """
         return region_queries.height_map(self._frozen, box_m)
+
+    def elevation(self, *, box_m: Box | None = None, clearance_m: float = CLEARANCE_M) -> Elevation:
+        """A level layer's surface: height with its uncertainty, slope, roughness, steps and obstacles by column.
+
+        Args:
+            box_m: its x and y bound the image; voxels above or below its z are left out.
+            clearance_m: height above the surface up to which things are obstacles.
+
+        Raises:
+            BadInputError: kind `not_level`: the layer has cubic voxels; `too_large`: more than 67 million pixels.
+        """
+        return region_queries.elevation(self._frozen, box_m, clearance_m)
 
     def floor_grid(self, *, ground_m: float, band_m: Band | None = None, box_m: Box | None = None) -> FloorGrid:
         """A storey as a ground robot sees it: 100 occupied, 0 free, -1 unknown, as in `nav_msgs/OccupancyGrid`.

@@ -25,7 +25,7 @@ Located = tuple[slice, int, npt.NDArray[np.int32], npt.NDArray[np.uint32]]
 
 def states_at(frozen: FrozenMap, points_m: npt.ArrayLike) -> npt.NDArray[np.uint8]:
     """(N,) `State` of the voxels that hold (N, 3) points."""
-    points = as_points(points_m, "points")
+    points = frozen.on_lattice(as_points(points_m, "points"))
     states = np.empty(len(points), np.uint8)
     check_within(kernels.states_into(frozen.grid, points, frozen.reach_m, states), frozen)
     return states
@@ -33,7 +33,7 @@ def states_at(frozen: FrozenMap, points_m: npt.ArrayLike) -> npt.NDArray[np.uint
 
 def counts_at(frozen: FrozenMap, points_m: npt.ArrayLike) -> npt.NDArray[np.int32]:
     """(N, 2) hits and misses of the voxels that hold (N, 3) points; zeros where unknown."""
-    points = as_points(points_m, "points")
+    points = frozen.on_lattice(as_points(points_m, "points"))
     counts = np.zeros((len(points), 2), np.int32)
     for part, slot, rows, places in _located(frozen, points):
         sums = frozen.bricks(slot).counts
@@ -43,7 +43,7 @@ def counts_at(frozen: FrozenMap, points_m: npt.ArrayLike) -> npt.NDArray[np.int3
 
 def log_odds_at(frozen: FrozenMap, points_m: npt.ArrayLike) -> Floats:
     """(N,) clamped log-odds of the voxels that hold (N, 3) points; NaN where unknown."""
-    points, model = as_points(points_m, "points"), frozen.model
+    points, model = frozen.on_lattice(as_points(points_m, "points")), frozen.model
     odds = np.full(len(points), np.nan)
     clamps = log_odds(model.p_min), log_odds(model.p_max)
     bounds = log_odds(model.p_occupied), *clamps
@@ -80,6 +80,7 @@ def reading_at(frozen: FrozenMap, points_m: npt.ArrayLike, channel: Channel) -> 
         # Up to 64 sums a point: chunk by chunk, lest they take more memory than the map.
         starts = range(0, len(points), CHUNK)
         return joined_readings([reading_at(frozen, points[start : start + CHUNK], channel) for start in starts])
+    points = frozen.on_lattice(points)
     planes = frozen.geometry.planes_of(channel.name)
     sums = np.zeros((len(points), planes.stop - planes.start), np.int64)
     for part, slot, rows, places in _located(frozen, points):
@@ -89,7 +90,7 @@ def reading_at(frozen: FrozenMap, points_m: npt.ArrayLike, channel: Channel) -> 
 
 def seen_at(frozen: FrozenMap, points_m: npt.ArrayLike) -> Floats:
     """(N,) times, UTC seconds since 1970, at which the voxels that hold (N, 3) points were seen last; NaN if never."""
-    points = as_points(points_m, "points")
+    points = frozen.on_lattice(as_points(points_m, "points"))
     seen_s = np.full(len(points), np.nan)
     for part, slot, rows, places in _located(frozen, points):
         if frozen.times is not None:
@@ -99,7 +100,8 @@ def seen_at(frozen: FrozenMap, points_m: npt.ArrayLike) -> Floats:
 
 def measured_at(frozen: FrozenMap, points_m: npt.ArrayLike, channel: Channel) -> Floats:
     """(N,) times, UTC seconds since 1970, of the newest samples of which `reading_at` is made; NaN where unknown."""
-    points, column = as_points(points_m, "points"), frozen.geometry.channels.index(channel)
+    points = frozen.on_lattice(as_points(points_m, "points"))
+    column = frozen.geometry.channels.index(channel)
     measured_s = np.full(len(points), np.nan)
     for part, slot, rows, places in _located(frozen, points):
         if frozen.times is not None:

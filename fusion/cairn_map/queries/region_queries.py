@@ -16,6 +16,7 @@ from cairn_map.evidence.voxels import Voxels, joined_voxels, voxels_of_evidence
 from cairn_map.queries import layer_kernels, point_queries
 from cairn_map.queries import layer_kernels as kernels
 from cairn_map.queries.frozen_map import Box, FrozenMap
+from cairn_map.queries.level.elevation import Elevation, elevation_of
 from cairn_map.queries.occupancy_kernels import list_bits_into
 from cairn_map.queries.occupancy_states import State
 from cairn_map.queries.point_queries import first_of_kind
@@ -70,8 +71,21 @@ def height_map(frozen: FrozenMap, box_m: Box | None) -> MapImage:
     check_pixels(low, high)
     tops = np.full((high[1] - low[1], high[0] - low[0]), NO_TOP)
     kernels.tops_into(frozen.grid, frozen.brick_corners(), low, high, tops)
-    heights = np.where(tops == NO_TOP, np.nan, (tops + 1) * frozen.geometry.voxel_edge_m)
+    heights = np.where(tops == NO_TOP, np.nan, (tops + 1) * frozen.geometry.voxel_height_m)
     return _image(frozen, heights, low)
+
+
+def elevation(frozen: FrozenMap, box_m: Box | None, clearance_m: float) -> Elevation:
+    """The surface of a level layer, over the columns of a box."""
+    low, high = frozen.voxels_of_box(box_m)
+    check_pixels(low, high)
+    side = frozen.geometry.side
+    cells = (
+        (frozen.keys[slot], frozen.cells[slot].packed())
+        for slot, first in enumerate(frozen.grid.cells * side)
+        if (first < high).all() and (first + side > low).all()
+    )
+    return elevation_of(cells, frozen.geometry, frozen.model, low=low, high=high, clearance_m=clearance_m)
 
 
 def _question(frozen: FrozenMap, what: str) -> Callable[[Floats], Values]:

@@ -23,7 +23,7 @@ from cairn_map.evidence.brick_cell import BrickCell
 from cairn_map.evidence.brick_counts import BrickNumbers
 from cairn_map.evidence.channels import Channel, ChannelKind
 from cairn_map.evidence.compact_cell import HeldCell, has_sums, opened, sums_of
-from cairn_map.evidence.grid import CellKey
+from cairn_map.evidence.grid import CellKey, check_cubes
 from cairn_map.queries.frozen_map import FrozenMap
 from cairn_map.queries.map_snapshot import MapSnapshot
 from cairn_map.queries.point_kernels import group_into
@@ -181,6 +181,8 @@ class MapRenderer:
         is_beyond: bool,
     ) -> SurfaceImage:
         # Check, and convert to what the kernel takes: lengths in voxel edges, float32.
+        # Rays step by one edge along all three axes.
+        check_cubes(frozen.geometry)
         T = checked_pose(T_map_camera, reach_m=frozen.reach_m)
         H, W, edge_m = sight.height, sight.width, frozen.geometry.voxel_edge_m
         if not 0 < range_max_m < np.inf:

@@ -21,7 +21,7 @@ from cairn_map.commits.cursor import Cursor
 from cairn_map.epochs.moment import time_from_text
 from cairn_map.errors import BadInputError, DamagedDataError, UnreachableError
 from cairn_map.evidence.brick_cell import brick_cell, reading_cell
-from cairn_map.evidence.grid import CellKey, cell_of_key
+from cairn_map.evidence.grid import CellKey, cell_of_key, check_cubes
 from cairn_map.render.camera_rays import cells_in_sight
 from cairn_map.render.map_picture import Ages, arrays_of, layer_picture, layer_values, npz_of
 from cairn_map.render.map_render import MapRenderer
@@ -133,10 +133,11 @@ class MapViews:
 
         Raises:
             BadInputError: kind `unknown_channel`: the map has no such layer; `too_large`: too many cells or voxels are
-                in sight; `too_costly`: it takes too long.
+                in sight; `too_costly`: it takes too long; `level_layer`.
             UnreachableError: kind `busy`: others are being made.
             DamagedCellError: kind `damaged_store`: a cell in sight is damaged.
         """
+        check_cubes(row.geometry)
         _get_ready()
         until_s = None if request.at is None else time_from_text(request.at)
         with self._cells.reading(row) as faults, self._store.snapshot(row) as snapshot:

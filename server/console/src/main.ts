@@ -41,7 +41,8 @@ async function start(why = ""): Promise<void> {
   open?.dispose();
   open = null;
   for (;;) {
-    const maps = await mapsOf(why);
+    // A level's voxels are flat, and would be drawn as cubes at wrong heights: `cairn map query MAP.LAYER elevation` draws it.
+    const maps = (await mapsOf(why)).filter(({ geometry }) => geometry.height_step_um === undefined);
     if (mine !== starts) return;
     const { map } = fromHash(location.hash);
     const info = map === null ? maps.toSorted((a, b) => b.size_bytes - a.size_bytes)[0] : maps.find(({ name }) => name === map);

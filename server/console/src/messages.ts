@@ -12,7 +12,7 @@ export type Triple = [number, number, number];
 
 export interface MapInfo {
   name: string;
-  geometry: { voxel_edge_um: number; depth: number; channels: Channel[] };
+  geometry: { voxel_edge_um: number; depth: number; channels: Channel[]; height_step_um?: number };
   sensor_model: { p_hit: number; p_miss: number; p_min: number; p_max: number; p_occupied: number };
   cursor: string;
   cells: number;

@@ -4,17 +4,30 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pytest
 from tests.fixtures.client.live_server import LiveServer
 from tests.fixtures.client.made import GEOMETRY, MAP, seen
+from tests.fixtures.client.robot_program import RIG
 from tests.fixtures.commands import cairn
 
-from cairn_client.folders.map_folder import _layers_of, open_layers
+from cairn_client.folders.map_folder import _layers_of, open_layers, open_map
 from cairn_client.http.api import MapApi
 from cairn_client.robot.robot import Robot
+from cairn_fusion.recording.scan import Scan
 from cairn_map.errors import NotFoundError
 from cairn_map.evidence.grid import cell_key
 from cairn_map.files.cell_folder import read_cells, read_head
 from cairn_map.queries.occupancy_states import State
+
+
+def sweep_of(points: np.ndarray[tuple[int, int], np.dtype[np.float64]], time_s: float) -> Scan:
+    """A sweep of points without order, seen from 2 m above the origin."""
+    pose = np.eye(4)
+    pose[2, 3] = 2.0
+    own = (points - pose[:3, 3]).astype(np.float32)
+    range_m = np.full((3, 4), np.nan, np.float32)
+    return Scan(time_s=1.5e9 + time_s, T_map_rig=pose, range_camera="tof", range_m=range_m, points_m=own)
 
 
 def test_a_layer_is_added_listed_and_mapped_into_drawn_and_saved(server: LiveServer, tmp_path: Path) -> None:
@@ -109,3 +122,52 @@ def test_what_is_no_layer_is_refused_with_the_next_step(server: LiveServer, tmp_
     assert "bad_layer" in refused(server.map_url, "Not this", "--voxel", "0.01")
     assert "layer of map" in refused(f"{server.map_url}.fine", "finer", "--voxel", "0.005")
     assert "MAP.LAYER" in refused(f"{server.map_url}.No", "finer", "--voxel", "0.005")
+
+
+def test_a_level_is_added_mapped_into_and_read_as_the_ground(server: LiveServer, tmp_path: Path) -> None:
+    url = f"{server.map_url}.ground"
+    said = cairn("map", "layer", "add", server.map_url, "ground", "--kind", "level", folder=tmp_path)
+    assert said.startswith(
+        f"layer ground of map {MAP}: voxels of 20 cm and 5 cm height, cells of 12.8 m, channels height"
+    )
+    assert "20 cm flat" in cairn("map", "layer", "list", server.map_url, folder=tmp_path)
+    # A ground that rises by 10 cm a metre, seen twice, and a post on it.
+    x, y = (each.ravel() for each in np.meshgrid(np.arange(0.1, 3, 0.2), np.arange(0.1, 2, 0.2)))
+    ground = np.stack([x, y, 0.1 * x], axis=1)
+    post = np.array([[1.5, 0.9, z] for z in np.arange(0.2, 1.2, 0.1)])
+    with Robot(RIG, url, directory=tmp_path / "mole", name="mole") as robot:
+        for time_s in (1.0, 2.0):
+            robot.observe(sweep_of(np.concatenate([ground, post]), time_s))
+        robot.commit()
+        robot.sync(until_folded=True)
+        own = robot.snapshot().elevation()
+    seen = open_map(url).elevation()
+    assert np.array_equal(own.height_m, seen.height_m, equal_nan=True)
+    columns = np.rint((ground[:, :2] - seen.origin_m) / 0.2).astype(int)
+    assert np.abs(seen.height_m[columns[:, 1], columns[:, 0]] - ground[:, 2]).max() <= 0.005
+    # The command, its files, and what a level does not answer.
+    png, npz = tmp_path / "g.png", tmp_path / "g.npz"
+    asked = ("map", "query", url, "elevation")
+    lines = cairn(*asked, "--png", str(png), "--npz", str(npz), folder=tmp_path).splitlines()
+    assert "150 known" in lines[0]
+    assert lines[2] == "99% of the known columns are passable"
+    assert png.read_bytes().startswith(b"\x89PNG")
+    with np.load(npz) as arrays:
+        assert np.nanmax(arrays["obstacle_m"]) == pytest.approx(0.95, abs=0.06)
+    found = json.loads(cairn(*asked, "--json", "--box=0,0,-1,1,1,1", folder=tmp_path))
+    assert np.array(found["height_m"], float).shape == (5, 5)
+    assert "not_level" in cairn("map", "query", server.map_url, "elevation", folder=tmp_path, code=1)
+    assert "level_layer" in cairn("map", "query", url, "ray", "0,0,1", "1,0,0", folder=tmp_path, code=1)
+    assert "level_layer" in cairn("map", "export", url, "--ot", str(tmp_path / "g.ot"), folder=tmp_path, code=1)
+    render = ("map", "render", url, "-o", str(tmp_path / "r.png"), "--from=0,0,2", "--to=1,0,0")
+    assert "level_layer" in cairn(*render, folder=tmp_path, code=1)
+
+
+def test_a_level_that_cannot_be_is_refused(server: LiveServer, tmp_path: Path) -> None:
+    def refused(*options: str) -> str:
+        return cairn("map", "layer", "add", server.map_url, "ground", *options, folder=tmp_path, code=1)
+
+    assert "needs --voxel" in refused()
+    assert "goes with --kind level" in refused("--voxel", "0.2", "--height-step", "0.05")
+    assert "leave out --channels" in refused("--kind", "level", "--channels", "colour")
+    assert "height step" in refused("--kind", "level", "--height-step", "0.3")

@@ -252,8 +252,8 @@ def test_a_copy_comes_whole_over_a_small_link(
 
 
 def test_a_place_is_in_its_cell() -> None:
-    assert cell_at((0.0, -0.1, 5.2), 0.4) == Cell(0, -1, 13)
-    assert cell_at((1e30, 0.0, -1e30), 0.4) == Cell((1 << 20) - 1, 0, -(1 << 20))
+    assert cell_at((0.0, -0.1, 5.2), (0.4, 0.4, 0.4)) == Cell(0, -1, 13)
+    assert cell_at((1e30, 0.0, -1e30), (0.4, 0.4, 0.4)) == Cell((1 << 20) - 1, 0, -(1 << 20))
 
 
 def test_the_small_profile_is_small() -> None:

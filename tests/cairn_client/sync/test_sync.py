@@ -158,7 +158,7 @@ def test_a_low_end_robot_fetches_the_cells_around_it_and_only_once(team: Team) -
     team["mole"].commit({A: X, B: Y})
     team.push("mole")
     team["bat"]
-    near_b = within((-0.1, 0.1, 0.9), radius_m=0.2, cell_edge_m=GEOMETRY.cell_edge_m)
+    near_b = within((-0.1, 0.1, 0.9), radius_m=0.2, cell_edges_m=GEOMETRY.cell_edges_m)
     assert team.fetch_cells("bat", wanted=near_b) == 1
     assert list(team["bat"].cells) == [B]
     assert team.fetch_cells("bat") == 1
@@ -213,7 +213,7 @@ def test_traffic_counts_what_bodies_cost(team: Team) -> None:
 
 @pytest.mark.parametrize("edge", ["touches", "misses"])
 def test_a_cell_is_near_if_some_point_of_it_is(edge: str) -> None:
-    is_near = within((0.5, 0.5, 0.5), radius_m=1.0 if edge == "touches" else 0.999, cell_edge_m=0.5)
+    is_near = within((0.5, 0.5, 0.5), radius_m=1.0 if edge == "touches" else 0.999, cell_edges_m=(0.5, 0.5, 0.5))
     assert is_near(Cell(3, 0, 0)) == (edge == "touches")
     assert is_near(Cell(0, 1, 1))
     assert not is_near(Cell(-4, 0, 0))

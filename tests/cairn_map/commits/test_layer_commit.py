@@ -102,7 +102,7 @@ def test_versions_and_metas_that_do_not_fit_are_refused() -> None:
     [
         lambda layer: layer | {"kind": "level"},
         lambda layer: layer | {"keep_epochs": 9},
-        lambda layer: layer | {"geometry": layer["geometry"] | {"height_step_um": 50_000}},
+        lambda layer: layer | {"geometry": layer["geometry"] | {"tilt_mrad": 50}},
     ],
 )
 def test_definitions_of_newer_programs_are_of_an_unknown_version(change: object) -> None:

@@ -10,6 +10,7 @@
     $ cairn map query lab/ hottest --count 5                  # where it is hot, hit twice or on a surface first
     $ cairn map query lab/ slice 0.5                          # a horizontal layer: # occupied, . free
     $ cairn map query lab/ height --box=-5,-5,0,5,5,2         # the highest surface of each column, metres
+    $ cairn map query http://127.0.0.1:8750/maps/lab.ground elevation --png ground.png   # of a level layer
     $ cairn map query lab/ --at 14:05 nearest 1,2,0.4         # as it was then, in a map with epochs
 
 A map is a URL, or a folder: one of `cairn map export --cells`, a clone, or the state folder of a robot that is not
@@ -30,6 +31,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -46,9 +48,11 @@ from cairn_map.epochs.layer import EVIDENCE
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.voxels import Reading
+from cairn_map.queries.level.elevation import CLEARANCE_M, Vehicle
 from cairn_map.queries.map_snapshot import MapSnapshot
 from cairn_map.queries.occupancy_states import State
 from cairn_map.queries.region_queries import MapImage
+from cairn_map.render.elevation_picture import elevation_npz, elevation_png
 from cairn_map.wire.hottest_messages import HOTTEST_MAX
 
 ZERO_CELSIUS_K = 273.15
@@ -101,7 +105,15 @@ def add_parser(commands: Subparsers) -> None:
     layer.add_argument("z", type=float, metavar="Z", help="metres, map frame")
     layer.add_argument("--what", default="state", help="state, probability, log_odds or a channel's name (state)")
     height = question("height", "the highest occupied surface of each column", _height)
-    for limited in (hottest, layer, height):
+    elevation = question("elevation", "the surface of a level layer: heights, slopes, steps, obstacles", _elevation)
+    elevation.add_argument("--png", type=Path, metavar="FILE", help="picture: green easy, red hard, dark red too much")
+    elevation.add_argument("--npz", type=Path, metavar="FILE", help="all of it as NumPy arrays")
+    elevation.add_argument(
+        "--clearance", type=float, default=CLEARANCE_M, metavar="METRES", help=f"the vehicle's height ({CLEARANCE_M})"
+    )
+    elevation.add_argument("--step", type=float, metavar="METRES", help="the vehicle's highest step (0.25)")
+    elevation.add_argument("--slope", type=float, metavar="DEGREES", help="the vehicle's steepest slope (30)")
+    for limited in (hottest, layer, height, elevation):
         limited.add_argument("--box", type=box, metavar="X0,Y0,Z0,X1,Y1,Z1", help="only in this box, metres")
 
 
@@ -264,6 +276,39 @@ def _slice(snapshot: MapSnapshot, args: argparse.Namespace) -> tuple[Any, list[s
 def _height(snapshot: MapSnapshot, args: argparse.Namespace) -> tuple[Any, list[str]]:
     image = snapshot.height_map(box_m=_corners(args))
     return _image_json(image), [_image_head(image), *_span(image.values, "height in m")]
+
+
+def _elevation(snapshot: MapSnapshot, args: argparse.Namespace) -> tuple[Any, list[str]]:
+    limits = {"step_max_m": args.step, "slope_max_rad": None if args.slope is None else math.radians(args.slope)}
+    vehicle = Vehicle(**{name: value for name, value in limits.items() if value is not None})
+    ground = snapshot.elevation(box_m=_corners(args), clearance_m=args.clearance)
+    known = np.isfinite(ground.height_m)
+    passable = ground.difficulty(vehicle)[known] <= 1
+    for path, made in ((args.png, elevation_png), (args.npz, elevation_npz)):
+        if path is not None:
+            try:
+                path.write_bytes(made(ground, vehicle))
+            except OSError as exc:
+                raise BadInputError("bad_output", f"cannot write {path}: {exc.strerror}") from exc
+    H, W = known.shape
+    lines = [f"{W} x {H} columns of {ground.edge_m:g} m, {int(known.sum())} known, from {_place(ground.origin_m)}"]
+    if known.any():
+        low, high = ground.height_m[known].min(), ground.height_m[known].max()
+        lines.append(f"height {low:.2f} to {high:.2f} m, +- {np.median(ground.sigma_m[known]):.3f} m in the median")
+        lines.append(f"{passable.mean():.0%} of the known columns are passable")
+    found = {name: _numbers(values) for name, values in ground.arrays().items()}
+    return found | {"difficulty": _numbers(ground.difficulty(vehicle))}, lines
+
+
+def _place(origin_m: tuple[float, float]) -> str:
+    return f"x {origin_m[0]:g} m, y {origin_m[1]:g} m"
+
+
+def _numbers(values: npt.NDArray[Any]) -> Any:
+    """An array as nested lists for JSON, unknown numbers null."""
+    found = values.astype(object)
+    found[~np.isfinite(values)] = None
+    return found.tolist()
 
 
 def _corners(args: argparse.Namespace) -> npt.NDArray[np.float64] | None:

@@ -117,7 +117,7 @@ def _wanted(args: argparse.Namespace, url: str, mode: Mode) -> Wanted | None:
     api, name = api_of(url, args.token)
     with api:
         geometry = api.map_info(name).geometry
-    return within(args.near, radius_m=args.radius, cell_edge_m=geometry.cell_edge_m)
+    return within(args.near, radius_m=args.radius, cell_edges_m=geometry.cell_edges_m)
 
 
 def _synced(robot: Robot) -> SyncReport:

@@ -17,6 +17,10 @@ from cairn_map.evidence.grid import CELL_LIMIT, CellKey, Geometry, cell_key, cel
 MAGIC = b"CRNC"
 VERSION = 1
 KIND_EVIDENCE = 1
+KIND_LEVEL = 3
+"""Kind of a cell of evidence with flat voxels: their height follows the fixed part."""
+HEIGHT_STEP = struct.Struct("<I")
+KNOWN_KINDS = (KIND_EVIDENCE, KIND_LEVEL)
 FLAG_SIGNED = 1
 FIXED_PART = struct.Struct("<4sBBBBIiiiIIBB")
 INDICES_AT = struct.calcsize("<4sBBBBI")
@@ -57,7 +61,7 @@ def encode_head(head: CellHead) -> bytes:
     data = FIXED_PART.pack(
         MAGIC,
         VERSION,
-        KIND_EVIDENCE,
+        kind_of(head.geometry),
         head.geometry.depth,
         FLAG_SIGNED if head.signed else 0,
         head.geometry.voxel_edge_um,
@@ -67,7 +71,28 @@ def encode_head(head: CellHead) -> bytes:
         len(head.geometry.channels),
         head.streams,
     )
-    return data + channels_to_bytes(head.geometry)
+    return data + height_to_bytes(head.geometry) + channels_to_bytes(head.geometry)
+
+
+def kind_of(geometry: Geometry) -> int:
+    """Kind byte of a geometry's cells."""
+    return KIND_LEVEL if geometry.is_flat else KIND_EVIDENCE
+
+
+def height_to_bytes(geometry: Geometry) -> bytes:
+    """Height of flat voxels, as it stands in a head before the channels; nothing of cubes."""
+    return b"" if geometry.height_step_um is None else HEIGHT_STEP.pack(geometry.height_step_um)
+
+
+def height_from_bytes(data: bytes, at: int, kind: int) -> tuple[int | None, int]:
+    """Height of a voxel of a cell of this kind, micrometres, None of a cube, and the offset behind it.
+
+    Raises:
+        struct.error: cut off.
+    """
+    if kind != KIND_LEVEL:
+        return None, at
+    return int(HEIGHT_STEP.unpack_from(data, at)[0]), at + HEIGHT_STEP.size
 
 
 def channels_to_bytes(geometry: Geometry) -> bytes:
@@ -108,14 +133,16 @@ def decode_head(data: bytes) -> tuple[CellHead, bytes]:
         data
     )
     # The fixed part; then the channels, whose lengths are in their own heads.
-    if version != VERSION or kind != KIND_EVIDENCE:
-        raise BadInputError("unknown_version", f"this reader knows cells of version 1, kind 1; got {version}, {kind}")
+    if version != VERSION or kind not in KNOWN_KINDS:
+        raise BadInputError(
+            "unknown_version", f"this reader knows cells of version 1, kind 1 and 3; got {version}, {kind}"
+        )
     if flags & ~FLAG_SIGNED or not all(-CELL_LIMIT <= v < CELL_LIMIT for v in (i, j, k)):
         raise DamagedDataError("bad_cell", "unknown flags, or a cell number out of range")
-    at = FIXED_PART.size
     try:
-        at = end_of_channels(data, at, channel_count)
-        geometry = _geometry(edge_um, depth, channel_count, data[FIXED_PART.size : at])
+        step_um, start = height_from_bytes(data, FIXED_PART.size, kind)
+        at = end_of_channels(data, start, channel_count)
+        geometry = _geometry(edge_um, step_um, depth, channel_count, data[start:at])
     except (struct.error, UnicodeDecodeError, ValidationError) as exc:
         raise DamagedDataError("bad_cell", f"the cell's head is damaged: {str(exc).splitlines()[0]}") from exc
     if not leaves <= voxels <= 8**depth:
@@ -161,7 +188,8 @@ def channels_from_bytes(data: bytes, count: int) -> tuple[Channel, ...]:
 
 def is_canonical_head(head: CellHead, data: bytes) -> bool:
     """True if a head's own bytes, as `decode_head` gave them, are those that `encode_head` makes of it."""
-    return _is_canonical(head.geometry, data[FIXED_PART.size :])  # pyright: ignore[reportArgumentType]
+    start = FIXED_PART.size + len(height_to_bytes(head.geometry))
+    return _is_canonical(head.geometry, data[start:])  # pyright: ignore[reportArgumentType]
 
 
 @lru_cache(maxsize=16)
@@ -171,9 +199,10 @@ def _is_canonical(geometry: Geometry, data: bytes) -> bool:
 
 
 @lru_cache(maxsize=16)
-def _geometry(edge_um: int, depth: int, channel_count: int, data: bytes) -> Geometry:
+def _geometry(edge_um: int, step_um: int | None, depth: int, channel_count: int, data: bytes) -> Geometry:
     """Geometry of a head; cached, because all cells of a map have the same one."""
-    return Geometry(voxel_edge_um=edge_um, depth=depth, channels=channels_from_bytes(data, channel_count))
+    channels = channels_from_bytes(data, channel_count)
+    return Geometry(voxel_edge_um=edge_um, height_step_um=step_um, depth=depth, channels=channels)
 
 
 def _channel(data: bytes, at: int) -> tuple[Channel, int]:
