@@ -31,6 +31,7 @@ import { mapFacts } from "./ui/map_facts.ts";
 import { MeasurePanel } from "./ui/measure_panel.ts";
 import { openCommit } from "./ui/retract_dialog.ts";
 import { ReferenceFrame } from "./ui/reference_frame.ts";
+import { Shelf } from "./ui/shelf.ts";
 import { TakeAwayPanel } from "./ui/take_away_panel.ts";
 import type { TopBar } from "./ui/top_bar.ts";
 import { VoxelPanel } from "./ui/voxel_panel.ts";
@@ -67,6 +68,7 @@ export class Console {
   private readonly look: Look;
   private readonly bar: TopBar;
   private readonly panel: LookPanel;
+  readonly shelf: Shelf;
   private readonly dutyPanel = new DutyPanel();
   private readonly takeAway: TakeAwayPanel;
   private readonly grid = new CellGrid();
@@ -109,6 +111,11 @@ export class Console {
     const left = h("aside", { class: "left", "aria-label": "Team and map" });
     const right = h("aside", { class: "right", "aria-label": "Tools" }, this.panel.element, this.voxel.element, this.measure.element, this.takeAway.element);
     this.element = h("div", { class: "console" }, left, view, right, h("footer", {}, this.strip.element, this.foot));
+    this.shelf = new Shelf(this.element, new Map([
+      ["look", this.panel.element], ["voxel", this.voxel.element], ["measure", this.measure.element], ["export", this.takeAway.element],
+    ]));
+    view.append(this.shelf.tools);
+    this.element.append(this.shelf.tabs);
     document.body.append(this.element);
     this.stage = new Stage(host);
     this.cells = new Cells(api, info);
@@ -176,6 +183,7 @@ export class Console {
     window.clearInterval(this.timer);
     this.link.close();
     this.cells.dispose();
+    this.shelf.dispose();
     this.findings.dispose();
     this.picker.dispose();
     this.frame.dispose();
@@ -226,8 +234,14 @@ export class Console {
     this.outline.show(picked);
     this.stage.draw();
     this.takeAway.choose(picked?.cell.key ?? null);
-    if (picked) void this.voxel.show(picked, this.cells.depthMax, this.heights.floorM);
-    else this.voxel.clear();
+    if (!picked) return this.askNothing();
+    this.shelf.open("voxel");
+    void this.voxel.show(picked, this.cells.depthMax, this.heights.floorM);
+  }
+
+  private askNothing(): void {
+    this.voxel.clear();
+    this.shelf.shut("voxel");
   }
 
   /** Fly to what lies under a place of the canvas, along the way one looks. */
@@ -257,7 +271,7 @@ export class Console {
     this.walker.end();
     this.outline.show(null);
     this.team.follow(null);
-    this.voxel.clear();
+    this.askNothing();
     this.findings.forget();
     this.say("");
     this.stage.draw();
@@ -308,6 +322,7 @@ export class Console {
     this.bar.onTheme = () => this.theme();
     this.panel.onChange = () => this.apply();
     this.measure.onChange = () => this.stage.draw();
+    this.measure.onSwitch = (isOn) => (isOn ? this.shelf.open("measure") : this.shelf.shut("measure"));
     this.panel.boxInView = () => this.picker.boxInView();
     this.panel.onStorey = (storey) => this.heights.showStorey(storey);
     this.heights.onCut = () => this.apply();
@@ -436,6 +451,7 @@ export class Console {
     this.duties.tick();
     this.findings.tick();
     this.dutyPanel.show(this.duties);
+    this.shelf.count("findings", this.findings.fresh ? `· ${this.findings.fresh} new` : "");
     this.team.tick(this.look.field, this.cells.head, this.duties.full);
     this.strip.show(this.team.names);
     const { lastSeq } = this.team;

@@ -102,6 +102,11 @@ export class FindingsDesk {
     this.land();
   }
 
+  /** Findings that no person spoke of yet. */
+  get fresh(): number {
+    return this.all.filter(({ state }) => state === "new").length;
+  }
+
   /** Fly to the finding of a number; false: there is none. */
   flyTo(number: number): void {
     const found = this.all.find((one) => one.number === number);

@@ -10,6 +10,8 @@ export class MeasurePanel {
   readonly element = h("section", { "aria-label": "Measure" });
   readonly lines = new LineSegments(new BufferGeometry(), new LineBasicMaterial({ color: PINK, depthTest: false }));
   onChange: () => void = () => {};
+  /** Clicks set points from now on, or no more. */
+  onSwitch: (isOn: boolean) => void = () => {};
   private readonly voxelM: number;
   private readonly points: Vector3[] = [];
   private readonly toggle = h("button", { type: "button", "aria-pressed": "false", title: "Clicks set points (M)" }, "Set points");
@@ -36,6 +38,7 @@ export class MeasurePanel {
   switch(): void {
     this.toggle.setAttribute("aria-pressed", String(!this.isOn));
     this.show();
+    this.onSwitch(this.isOn);
   }
 
   add(point: Vector3): void {
