@@ -1,8 +1,8 @@
-"""Sizes of screens, from a wide one to a phone on its side: the map has most of each, and fingers hit what they aim at."""
+"""Sizes of screens, from a wide one to a phone on its side: the map has most of each; fingers hit what they aim at."""
 
 import pytest
 from playwright.sync_api import Browser
-from tests.console.browsing import OVERFLOWING, TABLET, VIEW, Console, findings_of_axe, tab
+from tests.console.browsing import OVERFLOWING, TABLET, VIEW, Console, findings_of_axe
 from tests.console.room import Room
 
 pytestmark = pytest.mark.browser

@@ -29,6 +29,7 @@ import { DutyPanel } from "./ui/duty_panel.ts";
 import { LookPanel } from "./ui/look_panel.ts";
 import { mapFacts } from "./ui/map_facts.ts";
 import { MeasurePanel } from "./ui/measure_panel.ts";
+import { PlanPanel } from "./ui/plan_panel.ts";
 import { openCommit } from "./ui/retract_dialog.ts";
 import { ReferenceFrame } from "./ui/reference_frame.ts";
 import { Shelf } from "./ui/shelf.ts";
@@ -69,6 +70,7 @@ export class Console {
   private readonly bar: TopBar;
   private readonly panel: LookPanel;
   readonly shelf: Shelf;
+  readonly plan: PlanPanel;
   private readonly dutyPanel = new DutyPanel();
   private readonly takeAway: TakeAwayPanel;
   private readonly grid = new CellGrid();
@@ -140,6 +142,11 @@ export class Console {
     left.append(this.dutyPanel.element, this.findings.panel.element, this.camera.element, this.team.panel.element, mapFacts(info));
     this.appearance = new Appearance(look, this.stage, this.cells, this.book, this.spread);
     view.append(this.appearance.legend.element);
+    this.plan = new PlanPanel(this.stage, this.cells, this.heights, {
+      ink: () => this.appearance.planInk, findings: () => this.findings.all, robots: () => this.team.places,
+      choose: (id) => this.findings.fly(id), go: (place) => this.camera.over(place),
+    });
+    view.append(this.plan.small, this.plan.element);
     this.connect(onRefused);
     this.loading = Promise.resolve();
     this.link = new LiveLink(api, info.name, (event) => this.heard(event), (state) => (this.state = state), onRefused);
@@ -269,6 +276,7 @@ export class Console {
 
   forget(): void {
     this.walker.end();
+    if (this.plan.isOpen) this.plan.switch();
     this.outline.show(null);
     this.team.follow(null);
     this.askNothing();
@@ -308,7 +316,7 @@ export class Console {
     this.cells.onChange = (isWhole) => {
       if (isWhole) this.stage.draw();
       else this.stage.drawSoon();
-      if (!this.cells.isFetching) this.plan();
+      if (!this.cells.isFetching) this.replan();
       this.moved = true; // the ends of the palette follow what is shown
     };
     this.cells.onRefused = onRefused;
@@ -322,6 +330,7 @@ export class Console {
     this.bar.onTheme = () => this.theme();
     this.panel.onChange = () => this.apply();
     this.measure.onChange = () => this.stage.draw();
+    this.shelf.onPlan = () => this.plan.switch();
     this.measure.onSwitch = (isOn) => (isOn ? this.shelf.open("measure") : this.shelf.shut("measure"));
     this.panel.boxInView = () => this.picker.boxInView();
     this.panel.onStorey = (storey) => this.heights.showStorey(storey);
@@ -368,7 +377,7 @@ export class Console {
       if (event.cells === "many") void this.reload();
       else {
         for (const [i, j, k, lm] of event.cells) this.cells.changed([i, j, k], lm);
-        this.plan();
+        this.replan();
       }
     } else if (event.type === "log") {
       this.book.add(event.entries);
@@ -432,7 +441,7 @@ export class Console {
     }
     if (this.moved || this.cells.needsPlan || this.cells.waiting) {
       this.moved = false;
-      this.plan();
+      this.replan();
       this.appearance.refreshRange(this.team.names);
     }
     if (this.cursor) this.spread.tick(this.cells.head);
@@ -451,6 +460,7 @@ export class Console {
     this.duties.tick();
     this.findings.tick();
     this.dutyPanel.show(this.duties);
+    this.plan.tick();
     this.shelf.count("findings", this.findings.fresh ? `· ${this.findings.fresh} new` : "");
     this.team.tick(this.look.field, this.cells.head, this.duties.full);
     this.strip.show(this.team.names);
@@ -464,7 +474,7 @@ export class Console {
     this.foot.textContent = this.stage.isSoftware ? `${drawn} · drawn without a graphics card: coarser and slower` : drawn;
   }
 
-  private plan(): void {
+  private replan(): void {
     this.cells.update(this.stage.camera, this.stage.heightPx, this.stage.frustum);
   }
 

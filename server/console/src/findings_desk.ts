@@ -155,7 +155,8 @@ export class FindingsDesk {
       .filter(Boolean).join(" ");
   }
 
-  private fly(id: string): void {
+  /** Fly to where a finding is seen, and choose it. */
+  fly(id: string): void {
     const found = this.all.find((one) => one.id === id);
     if (!found) return;
     this.chosen = id;

@@ -88,6 +88,7 @@ const keys: Key[] = [
   ...FIELDS.map(({ field, label }, n) => ({ keys: [`Shift+${n + 1}`], what: `Colour by ${label.toLowerCase()}`, run: () => open?.setField(field) })),
   { keys: ["h", "f"], what: "All of the map", run: () => open?.camera.home() },
   { keys: ["t"], what: "From above", run: () => open?.camera.top() },
+  { keys: ["p"], what: "Plan of the storey, or back to the map", run: () => open?.plan.switch() },
   { keys: ["w"], what: "Walk: inside, at a person's height; then a step ahead", run: () => open?.walk(0, 1) },
   { keys: ["s"], what: "Who walks: a step back", run: () => open?.walk(0, -1) },
   { keys: ["a"], what: "Who walks: a step to the left", run: () => open?.walk(-1, 0) },

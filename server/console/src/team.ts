@@ -117,6 +117,11 @@ export class Team {
     return robot.clone().addScaledVector(back, awayM / wantedM);
   }
 
+  /** Where robots stand that told it. */
+  get places(): { name: string; place: Triple; colour: string }[] {
+    return [...this.marks].flatMap(([name, { position }]) => (position ? [{ name, place: position.toArray() as Triple, colour: robotColour(name, this.names) }] : []));
+  }
+
   /** Where the robot next to a place stands; null: no robot told. */
   nearest(place: Vector3): Vector3 | null {
     const places = [...this.marks.values()].flatMap(({ position }) => (position ? [position] : []));

@@ -24,8 +24,7 @@ export class Shelf {
   readonly tools = h("nav", { class: "shelf", "aria-label": "Tools" });
   /** Tabs under the sheet of a phone. */
   readonly tabs = h("nav", { class: "tabs", "aria-label": "Panels" });
-  /** A tool was opened or shut by its button. */
-  onTool: (tool: Tool) => void = () => {};
+  onPlan: () => void = () => {};
   private tool: Tool;
   private tab: Tab = "map";
   private readonly element: HTMLElement;
@@ -38,6 +37,7 @@ export class Shelf {
   constructor(element: HTMLElement, sections: ReadonlyMap<Tool, HTMLElement>) {
     this.element = element;
     this.sections = sections;
+    const plan = h("button", { type: "button", title: "The storey from straight above (P)", onclick: () => this.onPlan() }, "Plan");
     this.tool = localStorage.getItem(KEY) === "all" ? "all" : "none";
     const tools = TOOLS.map(([tool, name, title]) =>
       h("button", { type: "button", "data-tool": tool, title, onclick: () => this.press(tool) }, name));
@@ -46,7 +46,7 @@ export class Shelf {
       this.element.toggleAttribute("data-full");
       this.arrange();
     });
-    fill(this.tools, ...tools);
+    fill(this.tools, plan, ...tools);
     fill(this.tabs, ...tabs, this.size);
     this.phone.addEventListener("change", this.rearrange);
     this.arrange();
@@ -83,7 +83,6 @@ export class Shelf {
     this.tool = this.tool === tool ? "none" : tool;
     localStorage.setItem(KEY, this.tool === "all" ? "all" : "none");
     this.arrange();
-    this.onTool(this.tool);
   }
 
   /** The tab that is shown already shuts the sheet. */
