@@ -33,6 +33,7 @@ import { PlanPanel } from "./ui/plan_panel.ts";
 import { openCommit } from "./ui/retract_dialog.ts";
 import { ReferenceFrame } from "./ui/reference_frame.ts";
 import { Shelf } from "./ui/shelf.ts";
+import { showLink } from "./ui/link_dialog.ts";
 import { TakeAwayPanel } from "./ui/take_away_panel.ts";
 import type { TopBar } from "./ui/top_bar.ts";
 import { VoxelPanel } from "./ui/voxel_panel.ts";
@@ -136,6 +137,8 @@ export class Console {
     this.findings = new FindingsDesk(api, info, { stage: this.stage, cells: this.cells, picker: this.picker }, look, {
       fly: (to) => this.camera.go(to), look: () => this.apply(), say: (text) => this.say(text), isOperator: () => this.duties.isOperator,
       witness: (commit) => this.book.placeOf(commit),
+      link: (id) => showLink("This finding", new URL(toHash(info.name, look, null, id), document.baseURI).href),
+      plans: (width, height) => this.plan.pictures(width, height),
     });
     this.stage.add(this.findings.pins.group);
     view.append(this.findings.pins.element, this.findings.alarm.banner);
