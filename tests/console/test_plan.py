@@ -88,3 +88,26 @@ def test_a_cell_without_room_in_the_picture_is_no_gap(console: Console) -> None:
     finally:
         console.tell("(c.cells.budget = a[0], c.moved = true)", before)
         console.settled()
+
+
+def test_a_profile_shows_a_table_and_a_volume_is_that_of_what_stands_on_the_floor(console: Console) -> None:
+    """The floor's upper face is at 0; a table of 6 by 5 voxels ends 10 voxels over it."""
+    edge_m = GEOMETRY.voxel_edge_m
+    corners = [(18, 2), (28, 2), (28, 11), (18, 11)]
+    console.tell("c.measure.switch()")
+    try:
+        for x, y in corners:
+            console.tell("c.measure.add(c.stage.controls.target.clone().set(...a))", x * edge_m, y * edge_m, 0.0)
+        panel = console.page.get_by_role("region", name="Measure")
+        said = panel.inner_text()
+        volume = 6 * 5 * 10 * edge_m**3
+        assert f"{volume:.3f} m³" in said
+        assert f"{10 * 9 * edge_m**2:.2f} m²" in said
+        console.tell("(c.measure.clear(), null)")
+        for x in (18, 28):
+            console.tell("c.measure.add(c.stage.controls.target.clone().set(...a))", x * edge_m, 6.5 * edge_m, 0.0)
+        panel.get_by_role("img", name=f"surfaces from 0.00 m to {10 * edge_m:.2f} m in the map").wait_for()
+        console.settled()
+        assert console.page.locator(".length").inner_text() == f"{10 * edge_m:.2f} m"
+    finally:
+        console.tell("(c.measure.clear(), c.measure.switch())")

@@ -48,10 +48,10 @@ def put(api: MapApi, name: str, data: bytes) -> str:
     """A mark with an attachment; its key."""
     attachment = Attachment(sha256=hashlib.sha256(data).hexdigest(), size_bytes=len(data))
     text = MarkText(kind="person", name=name, place_m=(1.0, 1.0, 0.5), attachment=attachment)
-    api.put_mark(STORE, MarkRequest(mark=text))
+    receipt = api.put_mark(STORE, MarkRequest(mark=text))
     send_attachment(api, STORE, attachment, data)
-    (key,) = [entry.key for entry in api.marks(STORE).marks if entry.mark.name == name]
-    return key
+    assert receipt.key
+    return receipt.key
 
 
 @pytest.fixture(scope="module")

@@ -107,10 +107,11 @@ export class Console {
     this.voxel = new VoxelPanel(api, info.name, (seq) => this.book.robotAt(seq));
     this.takeAway = new TakeAwayPanel(api, info, look);
     this.panel = new LookPanel(look);
-    this.measure = new MeasurePanel(info.geometry.voxel_edge_um / 1e6);
+    this.cells = new Cells(api, info);
+    this.measure = new MeasurePanel(this.cells, info.geometry.voxel_edge_um / 1e6);
     this.empty = emptyMap(info.name);
     this.empty.hidden = true;
-    const view = h("main", { class: "view" }, host, this.empty, this.labels, h("div", { class: "notes" }, this.flag, this.chips.element));
+    const view = h("main", { class: "view" }, host, this.empty, this.labels, this.measure.words, h("div", { class: "notes" }, this.flag, this.chips.element));
     const left = h("aside", { class: "left", "aria-label": "Team and map" });
     const right = h("aside", { class: "right", "aria-label": "Tools" }, this.panel.element, this.voxel.element, this.measure.element, this.takeAway.element);
     this.element = h("div", { class: "console" }, left, view, right, h("footer", {}, this.strip.element, this.foot));
@@ -121,7 +122,6 @@ export class Console {
     this.element.append(this.shelf.tabs);
     document.body.append(this.element);
     this.stage = new Stage(host);
-    this.cells = new Cells(api, info);
     this.cells.budget = this.stage.isSoftware ? SOFTWARE_BUDGET : 2_000_000;
     this.spread = new Spread(api, info.name);
     this.heights = new Heights(look, this.cells, this.spread);
@@ -312,6 +312,7 @@ export class Console {
     this.stage.onFrame = () => {
       this.team.place();
       this.findings.pins.place();
+      this.measure.place(this.stage);
       this.frame.show();
       // Without a graphics card, frames would take the time of the cells that are still to come.
       return this.cells.isFresh && !(this.stage.isSoftware && this.cells.isFetching);
