@@ -13,6 +13,8 @@ import { drawPlan, fitOf, pixelOf, placeOf, type PlanInk, type PlanMarks } from 
 /** Between two rasters of a map that changes, ms; a click so near to a finding is its; px. */
 const AGAIN_MS = 1500;
 const NEAR_PX = 16;
+/** Pixels of a plan on paper to one of its words. */
+const PAPER_RATIO = 1.4;
 
 /** What the plan shows of the rest of the page, and does to it. */
 export interface PlanSource {
@@ -101,8 +103,9 @@ export class PlanPanel {
       if (!plan) return [];
       const marks = { ...this.marks(storey), view: null };
       const canvas = h("canvas", { width, height, role: "img", "aria-label": said(plan, marks.findings.length) });
-      drawPlan(canvas, plan, { ...this.source.ink(), theme: "light" }, marks, 2);
-      return [{ name: floorsM.length > 1 ? storeyName(storey, floorM - floorsM[0]) : "All heights", canvas, said: areas(plan) }];
+      drawPlan(canvas, plan, { ...this.source.ink(), theme: "light" }, marks, PAPER_RATIO);
+      const name = floorsM.length > 1 ? storeyName(storey, floorM - floorsM[0]) : floorsM.length ? "The storey, to 2 m over its floor" : "All heights";
+      return [{ name, canvas, said: areas(plan) }];
     });
   }
 

@@ -47,6 +47,8 @@ const INFERNO = textureOf("inferno") as DataTexture;
 /** Of a plan in its place, and the least of the scale bar, px. */
 const FILLED = 0.94;
 const BAR_PX = 90;
+/** A finding without another one so near has its temperature next to it, px. */
+const PIN = { wide: 62, high: 20 };
 /** Smaller plans have dots for findings, no numbers; px. */
 const SMALL_PX = 260;
 
@@ -78,7 +80,9 @@ export function drawPlan(canvas: HTMLCanvasElement, plan: FloorPlan, ink: PlanIn
   if (marks.view) drawEye(context, plan, fit, marks.view, ground.ink, ratio);
   for (const { name, place, colour } of marks.robots) drawRobot(context, pixelOf(plan, fit, place), small ? "" : name, colour, ground, ratio);
   // The first numbers lie on top.
-  for (const one of [...marks.findings].reverse()) drawPin(context, pixelOf(plan, fit, one.place), one, small, ground, ratio);
+  const pins = marks.findings.map((one) => ({ one, at: pixelOf(plan, fit, one.place) }));
+  const isFree = (n: number) => pins.every(({ at: [x, y] }, m) => m === n || Math.abs(y - pins[n].at[1]) > PIN.high * ratio || Math.abs(x - pins[n].at[0]) > PIN.wide * ratio);
+  for (let n = pins.length - 1; n >= 0; n--) drawPin(context, pins[n].at, pins[n].one, { small, isSaid: isFree(n) }, ground, ratio);
   if (!small) drawBar(context, canvas, plan, fit, ground.ink, ratio);
 }
 
@@ -156,7 +160,7 @@ function drawRobot(
 }
 
 function drawPin(
-  context: CanvasRenderingContext2D, [x, y]: [number, number], { number, state, celsius }: Finding, small: boolean, { ink, paper }: { ink: string; paper: string },
+  context: CanvasRenderingContext2D, [x, y]: [number, number], { number, state, celsius }: Finding, { small, isSaid }: { small: boolean; isSaid: boolean }, { ink, paper }: { ink: string; paper: string },
   ratio: number,
 ): void {
   context.beginPath();
@@ -172,7 +176,7 @@ function drawPin(
   context.textAlign = "center";
   context.textBaseline = "middle";
   context.fillText(String(number), x, y);
-  if (celsius !== null) write(context, `${celsius.toFixed(0)} °C`, x + 14 * ratio, y, ink, paper, ratio);
+  if (celsius !== null && isSaid) write(context, `${celsius.toFixed(0)} °C`, x + 14 * ratio, y, ink, paper, ratio);
 }
 
 function write(context: CanvasRenderingContext2D, text: string, x: number, y: number, ink: string, paper: string, ratio: number): void {

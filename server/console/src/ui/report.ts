@@ -80,7 +80,7 @@ function head({ geometry, commits }: MapInfo, { cursor, digest, cells }: MapDige
 function table(findings: readonly Finding[], zone: Zone): HTMLElement {
   const shown = findings.filter(({ state }) => state !== "dismissed");
   if (!shown.length) return h("p", {}, "No hot spots, and no marks.");
-  const heads = ["", "What", "Temperature", "x, y, z in the map, m", "Over the floor", "State", "By", "When", "Note"];
+  const heads = ["No.", "What", "Temperature", "x, y, z in the map, m", "Over the floor", "State", "By", "When", "Note"];
   const rows = shown.map(({ number, title, celsius, place, spot, state, entry }) => {
     const timeS = entry ? entry.mark.time_ms / 1000 : (spot?.captured_s?.[1] ?? spot?.measured_s);
     return [
