@@ -33,7 +33,14 @@ def branch(name: str, now_s: float) -> dict[str, object]:
         "note": "stuck at the stairs" if name == "robot17" else "",
     }
     behind = 99 if name == "robot09" else 0
-    head = {"branch": name, "mode": "high-end", "sensors": [], "cursor": None, "behind": behind, "behind_bytes": 0}
+    head: dict[str, object] = {
+        "branch": name,
+        "mode": "high-end",
+        "sensors": [],
+        "cursor": None,
+        "behind": behind,
+        "behind_bytes": 0,
+    }
     return head | {"last_seen_s": seen_s, "status": status, "view_s": None, "time_s": seen_s, "gone": False}
 
 

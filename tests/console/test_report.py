@@ -72,6 +72,8 @@ def keys(room: Room) -> dict[str, str]:
 def desk(chromium: Browser, room: Room, keys: dict[str, str]) -> Iterator[Console]:
     with chromium.new_context(viewport=VIEW, color_scheme="dark") as context:  # type: ignore[arg-type]
         found = tab(context, room)
+        other = hashlib.sha256(png() + b".").hexdigest()
+        found.page.route(f"**/attachments/{other}", lambda route: route.fulfill(body=png(), content_type="image/png"))
         found.open(f"#map={STORE}&find=mark+{keys['photo']}")
         found.log_in()
         found.settled()
@@ -91,8 +93,6 @@ def test_a_link_to_a_finding_chooses_it_and_its_picture_is_painted(desk: Console
 
 @pytest.mark.parametrize("name", list(SAID))
 def test_what_is_not_the_picture_that_a_mark_names_is_words_and_never_a_page(desk: Console, name: str) -> None:
-    digest = hashlib.sha256(png() + b".").hexdigest()
-    desk.page.route(f"**/attachments/{digest}", lambda route: route.fulfill(body=png(), content_type="image/png"))
     desk.page.locator(".find", has_text=name).click()
     desk.page.locator(".attached").get_by_text(SAID[name]).wait_for()
     assert desk.page.locator(".attached canvas, .attached img, iframe, object, embed").count() == 0
