@@ -112,7 +112,10 @@ def browser() -> Iterator[Browser]:
 
 
 def tab(context: BrowserContext, room: Room) -> Console:
-    return Console(context.new_page(), room)
+    """A tab of an operator who keeps all tools open in a column; a context's own page has none open."""
+    made = Console(context.new_page(), room)
+    made.page.add_init_script("localStorage.setItem('cairn.tools', localStorage.getItem('cairn.tools') ?? 'all')")
+    return made
 
 
 def skip_without_page() -> None:
@@ -125,9 +128,13 @@ def skip_without_page() -> None:
 
 def serious(console: Console, where: str) -> list[str]:
     """Serious findings of axe-core in the page as it is."""
+    return [each for each in findings_of_axe(console, where) if "serious" in each or "critical" in each]
+
+
+def findings_of_axe(console: Console, where: str) -> list[str]:
+    """All findings of axe-core in the page as it is."""
     violations = Axe().run(console.page).response["violations"]
     return [
         f"{where}: {each['id']}, {each['impact']}, at {len(each['nodes'])}: {each['nodes'][0]['html'][:160]}"
         for each in violations
-        if each["impact"] in ("serious", "critical")
     ]

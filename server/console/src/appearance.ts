@@ -10,6 +10,7 @@ import type { Spread } from "./scene/spread.ts";
 import type { Stage } from "./scene/stage.ts";
 import { rangeOf } from "./scene/statistics.ts";
 import { Legend, type Told, type Values } from "./ui/legend.ts";
+import type { PlanInk } from "./ui/plan_picture.ts";
 import { applyTheme } from "./ui/top_bar.ts";
 import { KELVIN_ZERO_C } from "./units.ts";
 
@@ -85,6 +86,13 @@ export class Appearance {
     const log = !isShort ? "whole" : this.book.isReading ? "read" : "short";
     if (this.book.ageS(head) === null) return { unit: "log entries", size: 1, log };
     return { ...ageUnit(range?.[1] ?? 0), log };
+  }
+
+  /** What a floor plan is drawn with: the same field, and the ends of the whole map's temperatures. */
+  get planInk(): PlanInk {
+    const locked = this.look.ranges.temperature;
+    const rangeK = locked ? (locked.map((end) => end + KELVIN_ZERO_C) as [number, number]) : this.spread.range("temperature");
+    return { theme: document.documentElement.dataset.theme === "light" ? "light" : "dark", field: this.look.field, rangeK };
   }
 
   /** Dark or light, as the page is. */

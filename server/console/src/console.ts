@@ -30,7 +30,10 @@ import { DutyPanel } from "./ui/duty_panel.ts";
 import { LookPanel } from "./ui/look_panel.ts";
 import { mapFacts } from "./ui/map_facts.ts";
 import { MeasurePanel } from "./ui/measure_panel.ts";
+import { PlanPanel } from "./ui/plan_panel.ts";
 import { ReferenceFrame } from "./ui/reference_frame.ts";
+import { Shelf } from "./ui/shelf.ts";
+import { showLink } from "./ui/link_dialog.ts";
 import { TakeAwayPanel } from "./ui/take_away_panel.ts";
 import type { TopBar } from "./ui/top_bar.ts";
 import { VoxelPanel } from "./ui/voxel_panel.ts";
@@ -67,6 +70,8 @@ export class Console {
   private readonly look: Look;
   private readonly bar: TopBar;
   private readonly panel: LookPanel;
+  readonly shelf: Shelf;
+  readonly plan: PlanPanel;
   private readonly dutyPanel = new DutyPanel();
   private readonly takeAway: TakeAwayPanel;
   private readonly grid = new CellGrid();
@@ -102,20 +107,25 @@ export class Console {
     this.voxel = new VoxelPanel(api, info.name, look, (seq) => this.book.robotAt(seq));
     this.takeAway = new TakeAwayPanel(api, info, look);
     this.panel = new LookPanel(look);
-    this.measure = new MeasurePanel(info.geometry.voxel_edge_um / 1e6);
+    this.cells = new Cells(api, info);
+    this.measure = new MeasurePanel(this.cells, info.geometry.voxel_edge_um / 1e6);
     this.empty = emptyMap(info.name);
     this.empty.hidden = true;
-    const view = h("main", { class: "view" }, host, this.empty, this.labels, h("div", { class: "notes" }, this.flag, this.chips.element));
+    const view = h("main", { class: "view" }, host, this.empty, this.labels, this.measure.words, h("div", { class: "notes" }, this.flag, this.chips.element));
     const left = h("aside", { class: "left", "aria-label": "Team and map" });
     const right = h("aside", { class: "right", "aria-label": "Tools" }, this.panel.element, this.voxel.element, this.measure.element, this.takeAway.element);
     const footer = h("footer");
     this.element = h("div", { class: "console" }, left, view, right, footer);
+    this.shelf = new Shelf(this.element, new Map([
+      ["look", this.panel.element], ["voxel", this.voxel.element], ["measure", this.measure.element], ["export", this.takeAway.element],
+    ]));
+    view.append(this.shelf.tools);
+    this.element.append(this.shelf.tabs);
     document.body.append(this.element);
     this.stage = new Stage(host);
-    this.cells = new Cells(api, info);
     this.cells.budget = this.stage.isSoftware ? SOFTWARE_BUDGET : 2_000_000;
     this.time = new TimeDesk(api, info, look, { stage: this.stage, cells: this.cells }, this.book, {
-      say: (text) => this.say(text), isOperator: () => this.duties.isOperator, plan: () => this.plan(), fly: (to) => this.camera.go(to),
+      say: (text) => this.say(text), isOperator: () => this.duties.isOperator, plan: () => this.replan(), fly: (to) => this.camera.go(to),
     });
     footer.append(this.strip.element);
     this.strip.head.append(this.foot);
@@ -134,12 +144,19 @@ export class Console {
     this.findings = new FindingsDesk(api, info, { stage: this.stage, cells: this.cells, picker: this.picker }, look, {
       fly: (to) => this.camera.go(to), look: () => this.apply(), say: (text) => this.say(text), isOperator: () => this.duties.isOperator,
       witness: (commit) => this.book.placeOf(commit),
+      link: (id) => showLink("This finding", new URL(toHash(info.name, look, null, id), document.baseURI).href),
+      plans: (width, height) => this.plan.pictures(width, height),
     });
     this.stage.add(this.findings.pins.group);
     view.append(this.findings.pins.element, this.findings.alarm.banner);
     left.append(this.dutyPanel.element, this.findings.panel.element, this.camera.element, this.team.panel.element, mapFacts(info));
     this.appearance = new Appearance(look, this.stage, this.cells, this.book, this.spread);
     view.append(this.appearance.legend.element);
+    this.plan = new PlanPanel(this.stage, this.cells, this.heights, {
+      ink: () => this.appearance.planInk, findings: () => this.findings.all, robots: () => this.team.places,
+      choose: (id) => this.findings.fly(id), go: (place) => this.camera.over(place),
+    });
+    view.append(this.plan.small, this.plan.element);
     this.connect(onRefused);
     this.loading = Promise.resolve();
     this.link = new LiveLink(api, info.name, (event) => this.heard(event), (state) => (this.state = state), onRefused);
@@ -188,6 +205,7 @@ export class Console {
     window.clearInterval(this.timer);
     this.link.close();
     this.cells.dispose();
+    this.shelf.dispose();
     this.findings.dispose();
     this.time.dispose();
     this.picker.dispose();
@@ -239,8 +257,14 @@ export class Console {
     this.outline.show(picked);
     this.stage.draw();
     this.takeAway.choose(picked?.cell.key ?? null);
-    if (picked) void this.voxel.show(picked, this.cells.depthMax, this.heights.floorM);
-    else this.voxel.clear();
+    if (!picked) return this.askNothing();
+    this.shelf.open("voxel");
+    void this.voxel.show(picked, this.cells.depthMax, this.heights.floorM);
+  }
+
+  private askNothing(): void {
+    this.voxel.clear();
+    this.shelf.shut("voxel");
   }
 
   /** Fly to what lies under a place of the canvas, along the way one looks. */
@@ -268,9 +292,10 @@ export class Console {
 
   forget(): void {
     this.walker.end();
+    if (this.plan.isOpen) this.plan.switch();
     this.outline.show(null);
     this.team.follow(null);
-    this.voxel.clear();
+    this.askNothing();
     this.findings.forget();
     this.say("");
     this.stage.draw();
@@ -300,6 +325,7 @@ export class Console {
     this.stage.onFrame = () => {
       this.team.place();
       this.findings.pins.place();
+      this.measure.place(this.stage);
       this.frame.show();
       // Without a graphics card, frames would take the time of the cells that are still to come.
       return this.cells.isFresh && !(this.stage.isSoftware && this.cells.isFetching);
@@ -307,7 +333,7 @@ export class Console {
     this.cells.onChange = (isWhole) => {
       if (isWhole) this.stage.draw();
       else this.stage.drawSoon();
-      if (!this.cells.isFetching) this.plan();
+      if (!this.cells.isFetching) this.replan();
       this.moved = true; // the ends of the palette follow what is shown
     };
     this.cells.onRefused = onRefused;
@@ -321,6 +347,8 @@ export class Console {
     this.bar.onTheme = () => this.theme();
     this.panel.onChange = () => this.apply();
     this.measure.onChange = () => this.stage.draw();
+    this.shelf.onPlan = () => this.plan.switch();
+    this.measure.onSwitch = (isOn) => (isOn ? this.shelf.open("measure") : this.shelf.shut("measure"));
     this.panel.boxInView = () => this.picker.boxInView();
     this.panel.onStorey = (storey) => this.heights.showStorey(storey);
     this.heights.onCut = () => this.apply();
@@ -365,7 +393,7 @@ export class Console {
       if (event.cells === "many") void this.reload();
       else {
         for (const [i, j, k, lm] of event.cells) this.cells.changed([i, j, k], lm);
-        this.plan();
+        this.replan();
       }
     } else if (event.type === "log") {
       this.book.add(event.entries);
@@ -429,7 +457,7 @@ export class Console {
     }
     if (this.moved || this.cells.needsPlan || this.cells.waiting) {
       this.moved = false;
-      this.plan();
+      this.replan();
       this.appearance.refreshRange(this.team.names);
     }
     if (this.cursor) this.spread.tick(this.cells.head);
@@ -449,6 +477,8 @@ export class Console {
     this.duties.tick();
     this.findings.tick();
     this.dutyPanel.show(this.duties);
+    this.plan.tick();
+    this.shelf.count("findings", this.findings.fresh ? `· ${this.findings.fresh} new` : "");
     this.team.tick(this.look.field, this.cells.head, this.duties.full);
     this.strip.show(this.team.names);
     this.time.tick();
@@ -462,7 +492,7 @@ export class Console {
     this.foot.textContent = this.stage.isSoftware ? `${drawn} · drawn without a graphics card: coarser and slower` : drawn;
   }
 
-  private plan(): void {
+  private replan(): void {
     this.cells.update(this.stage.camera, this.stage.heightPx, this.stage.frustum);
   }
 

@@ -3,6 +3,7 @@
 import { Vector3 } from "three";
 import type { Api } from "./api.ts";
 import { DISMISSED, findingsOf, markOfSpot, SEEN, wordOf, wordsAround, type Finding } from "./findings.ts";
+import { Attachments } from "./attachments.ts";
 import { csvOf, geoJsonOf } from "./findings_files.ts";
 import { HotSpotList } from "./hot_spot_list.ts";
 import type { CameraView, Look } from "./look.ts";
@@ -17,7 +18,10 @@ import { isShown, visibleFrom } from "./scene/viewpoint.ts";
 import { Alarm } from "./ui/alarm.ts";
 import { FindingsPanel, type Act } from "./ui/findings_panel.ts";
 import { openMark } from "./ui/mark_dialog.ts";
+import { openReport, type ReportSource } from "./ui/report.ts";
 
+/** A link's finding that does not come for so long is not there, ms. */
+const SEEK_MS = 15_000;
 const THRESHOLD_KEY = "cairn.hot";
 const WARM_C = 30;
 /** Flights to one thing: a nearer eye gets finer voxels, and what these show may stand in the way. */
@@ -34,6 +38,9 @@ export interface DeskActs {
   isOperator(): boolean;
   /** From where a commit was measured. */
   witness(commit: string): Triple | null;
+  /** Show a link to a finding. */
+  link(id: string): void;
+  plans: ReportSource["plans"];
 }
 
 export class FindingsDesk {
@@ -47,6 +54,9 @@ export class FindingsDesk {
   private chosen: string | null = null;
   /** A flight whose end is still to be looked at. */
   private flight: { place: Vector3; witness: Vector3 | null; left: number } | null = null;
+  /** What a link names, until it is there. */
+  private sought: { id: string; endMs: number } | null = null;
+  private readonly attachments: Attachments;
   private said = "";
   private changed = true;
   private readonly info: MapInfo;
@@ -64,7 +74,8 @@ export class FindingsDesk {
     this.look = look;
     this.acts = acts;
     const overC = Number(localStorage.getItem(THRESHOLD_KEY) ?? WARM_C);
-    this.panel = new FindingsPanel(overC, this.alarm.element);
+    this.attachments = new Attachments(api, info.name.split(".")[0]!);
+    this.panel = new FindingsPanel(overC, this.alarm.element, this.attachments);
     this.pins = new Pins(this.stage);
     this.marks = new MarkBook(api, info.name.split(".")[0]!); // marks are the map's, also where one of its layers is shown
     this.spots = new HotSpotList(api, info.name, overC);
@@ -73,6 +84,8 @@ export class FindingsDesk {
     this.panel.onAct = (act, id) => void this.act(act, id);
     this.panel.onMarking = () => (this.isMarking ? this.stopMarking() : this.startMarking());
     this.panel.onFile = (form) => this.save(form);
+    this.panel.onReport = () =>
+      void openReport({ api, info, attachments: this.attachments, findings: this.all, plans: (width, height) => this.acts.plans(width, height) });
     this.panel.onThreshold = (value) => {
       localStorage.setItem(THRESHOLD_KEY, String(value));
       this.spots.setThreshold(value);
@@ -100,6 +113,27 @@ export class FindingsDesk {
     }
     this.panel.show({ findings: this.all, chosen: this.chosen, isOperator: this.acts.isOperator(), isMarking: this.isMarking, said: this.words() });
     this.land();
+    this.find();
+  }
+
+  /** Fly to the finding that a link names, as soon as it is known. */
+  seek(id: string): void {
+    this.sought = { id, endMs: performance.now() + SEEK_MS };
+  }
+
+  private find(): void {
+    const { sought } = this;
+    if (!sought || this.cells.firstPictureMs === null) return;
+    const isThere = this.all.some(({ id }) => id === sought.id);
+    if (!isThere && performance.now() < sought.endMs) return;
+    this.sought = null;
+    if (isThere) this.fly(sought.id);
+    else this.acts.say("The finding that this link names is not in the map, or not any more.");
+  }
+
+  /** Findings that no person spoke of yet. */
+  get fresh(): number {
+    return this.all.filter(({ state }) => state === "new").length;
   }
 
   /** Fly to the finding of a number; false: there is none. */
@@ -150,7 +184,8 @@ export class FindingsDesk {
       .filter(Boolean).join(" ");
   }
 
-  private fly(id: string): void {
+  /** Fly to where a finding is seen, and choose it. */
+  fly(id: string): void {
     const found = this.all.find((one) => one.id === id);
     if (!found) return;
     this.chosen = id;
@@ -195,7 +230,8 @@ export class FindingsDesk {
     if (!found) return;
     const { spot, entry } = found;
     try {
-      if (act === "mark" && spot) this.ask("Mark this hot spot", markOfSpot(spot), entry?.key ?? null);
+      if (act === "link") this.acts.link(id);
+      else if (act === "mark" && spot) this.ask("Mark this hot spot", markOfSpot(spot), entry?.key ?? null);
       else if (act === "edit" && entry) {
         const { kind, name, place_mm, extent_mm, note, attachment } = entry.mark;
         const metres = (each: Triple) => each.map((value) => value / 1000) as Triple;

@@ -49,8 +49,11 @@ export function defaultLook(): Look {
   };
 }
 
-/** The part of an address behind #. */
-export function toHash(map: string, look: Look, camera: CameraView | null): string {
+/** Findings as addresses name them: a mark by its key, a hot spot by its hottest voxel. */
+const FIND = /^(mark [a-z0-9._-]+:\d+|spot -?\d+,-?\d+,-?\d+)$/;
+
+/** The part of an address behind #; `find`: the finding that it leads to. */
+export function toHash(map: string, look: Look, camera: CameraView | null, find: string | null = null): string {
   const parts: [string, string][] = [["map", map]];
   const add = (name: string, value: string | null) => value !== null && parts.push([name, value]);
   const numbers = (values: number[], digits = 2) => values.map((value) => +value.toFixed(digits)).join(",");
@@ -66,10 +69,11 @@ export function toHash(map: string, look: Look, camera: CameraView | null): stri
   add("since", look.sinceS === null ? null : String(look.sinceS));
   add("eye", camera && numbers(camera.eye));
   add("target", camera && numbers(camera.target));
+  add("find", find && find.replace(" ", "+"));
   return "#" + parts.map(([name, value]) => `${name}=${value}`).join("&");
 }
 
-export function fromHash(hash: string): { map: string | null; look: Look; camera: CameraView | null } {
+export function fromHash(hash: string): { map: string | null; look: Look; camera: CameraView | null; find: string | null } {
   const given = new Map(hash.replace(/^#/, "").split("&").map((part) => part.split("=", 2) as [string, string]));
   const look = defaultLook();
   const numbers = (name: string, count: number): number[] | null => {
@@ -99,5 +103,9 @@ export function fromHash(hash: string): { map: string | null; look: Look; camera
   const eye = numbers("eye", 3) as Triple | null;
   const target = numbers("target", 3) as Triple | null;
   const map = given.get("map") ?? null;
-  return { map: map && /^[a-z0-9][a-z0-9_-]{0,31}(\.[a-z][a-z0-9_]{0,31})?$/.test(map) ? map : null, look, camera: eye && target && { eye, target } };
+  const find = (given.get("find") ?? "").replace("+", " ");
+  return {
+    map: map && /^[a-z0-9][a-z0-9_-]{0,31}(\.[a-z][a-z0-9_]{0,31})?$/.test(map) ? map : null, look, camera: eye && target && { eye, target },
+    find: FIND.test(find) ? find : null,
+  };
 }

@@ -3,7 +3,7 @@
 import "./style.css";
 import { Api, ApiError } from "./api.ts";
 import { Console } from "./console.ts";
-import { fill, h } from "./dom.ts";
+import { fill } from "./dom.ts";
 import { FIELDS, fromHash } from "./look.ts";
 import type { MapInfo } from "./messages.ts";
 import { hasWebGl } from "./scene/stage.ts";
@@ -11,7 +11,7 @@ import { message, noMap, pause, unknownMap } from "./ui/dead_ends.ts";
 import { listen, showKeys, type Key } from "./ui/keys.ts";
 import { logIn } from "./ui/login.ts";
 import { StillPictures } from "./ui/still_pictures.ts";
-import { copied } from "./ui/take_away_panel.ts";
+import { showLink } from "./ui/link_dialog.ts";
 import { applyTheme, TopBar } from "./ui/top_bar.ts";
 
 const api = new Api();
@@ -55,7 +55,7 @@ async function start(why = ""): Promise<void> {
 }
 
 function show(maps: MapInfo[], info: MapInfo): void {
-  const { look, camera } = fromHash(location.hash);
+  const { look, camera, find } = fromHash(location.hash);
   fill(document.body);
   document.title = `${info.name} · cairn`;
   const again = (why: string) => {
@@ -70,18 +70,14 @@ function show(maps: MapInfo[], info: MapInfo): void {
   // Many requests may be refused at once; the first one asks who is there.
   const refused = () => mine === starts && again("You are logged out: this token ended, or was revoked. With another one the page goes on where it was.");
   open = new Console(api, info, look, camera, bar, refused);
+  if (find) open.findings.seek(find);
   if (new URLSearchParams(location.search).has("test")) Object.assign(window, { cairn: { api, console: open } });
 }
 
 function share(): void {
   const address = open?.address ?? location.href;
   history.replaceState(null, "", address);
-  const close = h("button", { type: "button" }, "Close");
-  const dialog = h("dialog", { class: "share", "aria-label": "Share" }, h("h2", {}, "This very view"), copied(address), close);
-  close.addEventListener("click", () => dialog.close());
-  dialog.addEventListener("close", () => dialog.remove());
-  document.body.append(dialog);
-  dialog.showModal();
+  showLink("This very view", address);
 }
 
 const NUMBERED = ["1", "2", "3", "4", "5", "6", "7", "8", "9"];
@@ -89,6 +85,7 @@ const keys: Key[] = [
   ...FIELDS.map(({ field, label }, n) => ({ keys: [`Shift+${n + 1}`], what: `Colour by ${label.toLowerCase()}`, run: () => open?.setField(field) })),
   { keys: ["h", "f"], what: "All of the map", run: () => open?.camera.home() },
   { keys: ["t"], what: "From above", run: () => open?.camera.top() },
+  { keys: ["p"], what: "Plan of the storey, or back to the map", run: () => open?.plan.switch() },
   { keys: ["w"], what: "Walk: inside, at a person's height; then a step ahead", run: () => open?.walk(0, 1) },
   { keys: ["s"], what: "Who walks: a step back", run: () => open?.walk(0, -1) },
   { keys: ["a"], what: "Who walks: a step to the left", run: () => open?.walk(-1, 0) },
@@ -125,8 +122,9 @@ applyTheme();
 listen(keys);
 // A shared link that is opened where the page already is, or Back after a flight.
 function follow(): void {
-  const { map, look, camera } = fromHash(location.hash);
-  if (open && open.name === map && camera) open.take(look, camera);
+  const { map, look, camera, find } = fromHash(location.hash);
+  if (open && open.name === map && find) open.findings.seek(find);
+  else if (open && open.name === map && camera) open.take(look, camera);
   else void start();
 }
 window.addEventListener("hashchange", follow);

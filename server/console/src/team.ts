@@ -12,7 +12,7 @@ import type { Cells } from "./scene/cells.ts";
 import { freeM } from "./scene/line_of_sight.ts";
 import { RobotMark, TRAIL_MAX } from "./scene/lines.ts";
 import type { Stage } from "./scene/stage.ts";
-import { stacked } from "./ui/label_stack.ts";
+import { LeaderLines, type SeenLabel } from "./ui/leader_lines.ts";
 import { RobotMap } from "./ui/robot_map.ts";
 import { RobotPicture } from "./ui/robot_picture.ts";
 import { isOffline, TeamPanel } from "./ui/team_panel.ts";
@@ -38,6 +38,7 @@ export class Team {
   private readonly marks = new Map<string, RobotMark>();
   private readonly labels = new Map<string, HTMLElement>();
   private readonly host: HTMLElement;
+  private readonly leaders: LeaderLines;
   private readonly api: Api;
   private readonly map: string;
   private readonly stage: Stage;
@@ -50,6 +51,7 @@ export class Team {
     this.api = api;
     this.map = map;
     this.host = host;
+    this.leaders = new LeaderLines(host);
     this.stage = stage;
     this.cells = cells;
     this.picture = new RobotPicture(api, map);
@@ -117,6 +119,11 @@ export class Team {
     return robot.clone().addScaledVector(back, awayM / wantedM);
   }
 
+  /** Where robots stand that told it. */
+  get places(): { name: string; place: Triple; colour: string }[] {
+    return [...this.marks].flatMap(([name, { position }]) => (position ? [{ name, place: position.toArray() as Triple, colour: robotColour(name, this.names) }] : []));
+  }
+
   /** Where the robot next to a place stands; null: no robot told. */
   nearest(place: Vector3): Vector3 | null {
     const places = [...this.marks.values()].flatMap(({ position }) => (position ? [position] : []));
@@ -145,19 +152,17 @@ export class Team {
     this.show();
   }
 
-  /** Labels beside the robots, where these are in the picture now; by name, so that a stack keeps its order. */
+  /** Labels next to the robots, where these are in the picture now; by name, so that a stack keeps its order. */
   place(): void {
     const { clientWidth, clientHeight } = this.stage.canvas;
-    const seen: { label: HTMLElement; x: number; y: number }[] = [];
+    const seen: SeenLabel[] = [];
     for (const [name, mark] of [...this.marks].sort(([a], [b]) => (a < b ? -1 : 1))) {
       const label = this.labels.get(name)!;
       const at = mark.position?.clone().project(this.stage.camera);
       label.hidden = !at || at.z > 1 || Math.abs(at.x) > 1 || Math.abs(at.y) > 1;
-      if (at && !label.hidden) seen.push({ label, x: ((at.x + 1) / 2) * clientWidth, y: ((1 - at.y) / 2) * clientHeight });
+      if (at && !label.hidden) seen.push({ name, label, x: ((at.x + 1) / 2) * clientWidth, y: ((1 - at.y) / 2) * clientHeight });
     }
-    const boxes = seen.map(({ label, x, y }) => ({ x, y, width: label.offsetWidth, height: label.offsetHeight }));
-    const tops = stacked(boxes, clientHeight);
-    seen.forEach(({ label, x }, n) => (label.style.transform = `translate(${x}px, ${tops[n]}px)`));
+    this.leaders.place(seen, clientWidth, clientHeight);
   }
 
   private show(): void {

@@ -6,8 +6,9 @@ export function celsius(kelvin: number, digits = 1): string {
   return `${(kelvin - KELVIN_ZERO_C).toFixed(digits)} °C`;
 }
 
+/** Never minus nothing. */
 export function metres(value: number, digits = 2): string {
-  return `${value.toFixed(digits)} m`;
+  return `${value.toFixed(digits).replace(/^-(0(\.0*)?)$/, "$1")} m`;
 }
 
 export function bytes(count: number): string {

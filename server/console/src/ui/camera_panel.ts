@@ -3,7 +3,7 @@
 import { Box3, Vector3 } from "three";
 import { h } from "../dom.ts";
 import type { CameraView } from "../look.ts";
-import type { MapInfo } from "../messages.ts";
+import type { MapInfo, Triple } from "../messages.ts";
 import type { Cells } from "../scene/cells.ts";
 import { uniforms } from "../scene/materials.ts";
 import type { Stage } from "../scene/stage.ts";
@@ -13,6 +13,8 @@ import { visibleFrom } from "../scene/viewpoint.ts";
 import type { Team } from "../team.ts";
 
 const SIDE = new Vector3(-0.7, -1, 0.75);
+/** How much of the map is seen around a place that is looked at from above, m. */
+const OVER_M = 6;
 const ABOVE = new Vector3(0, -0.001, 1);
 
 export class CameraPanel {
@@ -61,6 +63,12 @@ export class CameraPanel {
 
   top(): void {
     this.go(this.stage.lookAt(this.cells.tightBoxes, ABOVE));
+  }
+
+  /** Look down at a place, from a room's width over it. */
+  over(place: Triple): void {
+    const around = new Box3().setFromCenterAndSize(new Vector3(...place), new Vector3(OVER_M, OVER_M, 0.5));
+    this.go(this.stage.lookAt([around], ABOVE));
   }
 
   /** Stand on the floor, as near as can be to where a robot is, and look where most of the map is seen. */

@@ -1,10 +1,14 @@
 /** The list of findings: where each is, who says so, and what an operator may do about it. */
 
+import { attachmentOf, type Attachments } from "../attachments.ts";
 import { fill, h } from "../dom.ts";
 import { factsOf, type Finding } from "../findings.ts";
+import type { Mark } from "../messages.ts";
 
 /** Rows of the list; more are in the files. */
 const ROWS_MAX = 100;
+/** Twice the width that it is shown in. */
+const PICTURE_PX = 400;
 const STATES: Record<Finding["state"], string> = { new: "new", seen: "seen", dismissed: "dismissed", mark: "mark" };
 
 export interface FindingsShown {
@@ -17,7 +21,7 @@ export interface FindingsShown {
   readonly said: string;
 }
 
-export type Act = "seen" | "dismiss" | "again" | "mark" | "edit" | "remove";
+export type Act = "seen" | "dismiss" | "again" | "mark" | "edit" | "remove" | "link";
 
 export class FindingsPanel {
   readonly element = h("section", { class: "findings", "aria-label": "Findings" });
@@ -25,6 +29,7 @@ export class FindingsPanel {
   onAct: (act: Act, id: string) => void = () => {};
   onMarking: () => void = () => {};
   onThreshold: (overC: number) => void = () => {};
+  onReport: () => void = () => {};
   onFile: (form: "csv" | "geojson") => void = () => {};
   private readonly head = h("h2", {});
   private readonly list = h("ol", { class: "finds" });
@@ -35,7 +40,10 @@ export class FindingsPanel {
   private last: FindingsShown | null = null;
   private written = "";
 
-  constructor(overC: number, alarm: HTMLElement) {
+  private readonly attachments: Attachments;
+
+  constructor(overC: number, alarm: HTMLElement, attachments: Attachments) {
+    this.attachments = attachments;
     this.over = h("input", { type: "number", step: "1", value: String(overC), "aria-label": "Hot spots from, in degrees Celsius" });
     this.over.addEventListener("change", () => {
       if (Number.isFinite(this.over.valueAsNumber)) this.onThreshold(this.over.valueAsNumber);
@@ -45,9 +53,10 @@ export class FindingsPanel {
     this.all.addEventListener("change", () => this.last && this.show(this.last));
     const file = (form: "csv" | "geojson", name: string) =>
       h("button", { type: "button", title: "All findings, in metres of the map", onclick: () => this.onFile(form) }, name);
+    const report = h("button", { type: "button", title: "Plans, findings, pictures and what proves them, to be printed", onclick: () => this.onReport() }, "Report");
     fill(
       this.element, this.head, this.list, this.said,
-      h("div", { class: "buttons" }, this.marking, file("csv", "CSV"), file("geojson", "GeoJSON")),
+      h("div", { class: "buttons" }, this.marking, file("csv", "CSV"), file("geojson", "GeoJSON"), report),
       h("details", {}, h("summary", {}, "What counts, and alarm"),
         h("label", { class: "over" }, "Hot spots from ", this.over, " °C"),
         h("label", { class: "check" }, this.all, "Show dismissed"), alarm),
@@ -89,6 +98,7 @@ export class FindingsPanel {
     );
     if (!isChosen) return h("li", {}, button);
     const act = (what: Act, name: string) => h("button", { type: "button", "data-find": `${what} ${id}`, onclick: () => this.onAct(what, id) }, name);
+    const link = act("link", "Link");
     const acts = !isOperator ? []
       : state === "mark" ? [act("edit", "Edit …"), act("remove", "Take out")]
       : [
@@ -98,7 +108,18 @@ export class FindingsPanel {
     return h(
       "li", {}, button,
       celsius !== null && state === "mark" ? h("p", {}, title) : null, h("p", { class: "hint" }, factsOf(one)),
-      entry?.mark.note ? h("p", { class: "note" }, entry.mark.note) : null, acts.length ? h("div", { class: "buttons" }, ...acts) : null,
+      entry?.mark.note ? h("p", { class: "note" }, entry.mark.note) : null,
+      entry && state === "mark" && attachmentOf(entry.mark) ? this.picture(entry.mark) : null, h("div", { class: "buttons" }, ...acts, link),
     );
+  }
+
+  /** The picture of a mark, once it is there; until then, and if it cannot be shown, words. */
+  private picture(mark: Mark): HTMLElement {
+    const place = h("figure", { class: "attached" }, h("p", { class: "hint" }, "The picture is on its way …"));
+    this.attachments.picture(mark, PICTURE_PX).then(
+      (picture) => fill(place, picture),
+      (error: unknown) => fill(place, h("p", { class: "hint" }, (error as Error).message)),
+    );
+    return place;
   }
 }

@@ -24,6 +24,21 @@ export function stacked(boxes: readonly LabelBox[], heightPx: number): number[] 
   });
 }
 
+/** Labels that would lie over one another, in groups, by number; each where it would stand by itself. */
+export function heaps(boxes: readonly LabelBox[]): number[][] {
+  const heapOf = boxes.map((_, n) => n);
+  boxes.forEach((box, n) => {
+    for (let m = 0; m < n; m++) {
+      if (!areOver(box, boxes[m])) continue;
+      const [from, to] = [heapOf[n], heapOf[m]];
+      heapOf.forEach((heap, k) => (heapOf[k] = heap === from ? to : heap));
+    }
+  });
+  const found = new Map<number, number[]>();
+  heapOf.forEach((heap, n) => found.set(heap, [...(found.get(heap) ?? []), n]));
+  return [...found.values()];
+}
+
 function areOver(a: LabelBox, b: LabelBox): boolean {
   const across = a.x < b.x + b.width && b.x < a.x + a.width;
   // Less than the gap that they are given, which may be rounded.

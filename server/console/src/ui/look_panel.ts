@@ -172,7 +172,7 @@ export class LookPanel {
   }
 }
 
-function storeyName(storey: number, overM: number): string {
+export function storeyName(storey: number, overM: number): string {
   return storey === 0 ? "Lowest" : `+${overM.toFixed(1)} m`;
 }
 

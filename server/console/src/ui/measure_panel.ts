@@ -1,23 +1,37 @@
-/** Lengths and areas by clicks: each click on a surface adds a point, where the pixel's ray meets the voxel. */
+/** Measures by clicks: lengths, profiles, areas and volumes; each click on a surface adds a point, where the pixel's ray meets the voxel.
+ *
+ * What was measured is written at its line, too, and is of what is shown: a ceiling that is cut off is not in it. */
 
 import { BufferGeometry, Float32BufferAttribute, LineBasicMaterial, LineSegments, Vector3 } from "three";
-import { facts, fill, h } from "../dom.ts";
+import { facts, fill, h, svg } from "../dom.ts";
+import type { Cells } from "../scene/cells.ts";
+import { profileOf, volumeOver, type Profile } from "../scene/section.ts";
+import type { Stage } from "../scene/stage.ts";
 import { metres } from "../units.ts";
 
 const PINK = 0xff3d7f;
+/** Of the profile's picture, px. */
+const PROFILE = { width: 244, height: 80 };
 
 export class MeasurePanel {
   readonly element = h("section", { "aria-label": "Measure" });
   readonly lines = new LineSegments(new BufferGeometry(), new LineBasicMaterial({ color: PINK, depthTest: false }));
   onChange: () => void = () => {};
+  /** Clicks set points from now on, or no more. */
+  onSwitch: (isOn: boolean) => void = () => {};
   private readonly voxelM: number;
   private readonly points: Vector3[] = [];
   private readonly toggle = h("button", { type: "button", "aria-pressed": "false", title: "Clicks set points (M)" }, "Set points");
   private readonly undo = h("button", { type: "button" }, "Undo");
   private readonly again = h("button", { type: "button" }, "Clear");
   private readonly said = h("div", { role: "status" });
+  /** Words at the lines, in the picture. */
+  readonly words = h("div", { class: "lengths", "aria-hidden": "true" });
+  private written: { word: HTMLElement; at: Vector3 }[] = [];
+  private readonly cells: Cells;
 
-  constructor(voxelM: number) {
+  constructor(cells: Cells, voxelM: number) {
+    this.cells = cells;
     this.voxelM = voxelM;
     this.lines.frustumCulled = false;
     this.lines.renderOrder = 11;
@@ -36,6 +50,7 @@ export class MeasurePanel {
   switch(): void {
     this.toggle.setAttribute("aria-pressed", String(!this.isOn));
     this.show();
+    this.onSwitch(this.isOn);
   }
 
   add(point: Vector3): void {
@@ -46,6 +61,24 @@ export class MeasurePanel {
   clear(): void {
     this.points.length = 0;
     this.show();
+  }
+
+  /** Before a frame: words at their lines. */
+  place({ camera, canvas }: Stage): void {
+    for (const { word, at } of this.written) {
+      const { x, y, z } = at.clone().project(camera);
+      word.hidden = z > 1 || Math.abs(x) > 1 || Math.abs(y) > 1;
+      word.style.transform = `translate(${((x + 1) / 2) * canvas.clientWidth}px, ${((1 - y) / 2) * canvas.clientHeight}px)`;
+    }
+  }
+
+  private write(steps: readonly number[]): void {
+    this.written = steps.map((step, n) => {
+      const { rise, level } = riseOf(this.points[n], this.points[n + 1]);
+      const parts = Math.abs(rise) > this.voxelM && level > this.voxelM ? ` (level ${metres(level)}, rises ${metres(rise)})` : "";
+      return { word: h("span", { class: "length" }, metres(step) + parts), at: this.points[n].clone().lerp(this.points[n + 1], 0.5) };
+    });
+    fill(this.words, ...this.written.map(({ word }) => word));
   }
 
   private show(): void {
@@ -66,16 +99,46 @@ export class MeasurePanel {
     this.lines.geometry.setAttribute("position", new Float32BufferAttribute(ends, 3));
     const rows: [string, string][] = [];
     if (steps.length) {
-      const rise = points[points.length - 1].z - points[points.length - 2].z;
-      rows.push(["last step", `${metres(steps[steps.length - 1])}, rises ${metres(rise)}`]);
+      const { rise, level } = riseOf(points[points.length - 2], points[points.length - 1]);
+      rows.push(["last step", `${metres(steps[steps.length - 1])}, rises ${metres(rise)}`], ["level", metres(level)]);
     }
     if (steps.length > 1) rows.push(["along all", metres(steps.reduce((sum, step) => sum + step, 0))]);
-    if (points.length > 2) rows.push(["area", `${areaOf(points).toFixed(2)} m²`]);
-    const hint = !this.isOn && !points.length ? "Lengths of two clicks, areas of three or more."
+    if (points.length > 2) {
+      rows.push(["area", `${areaOf(points).toFixed(2)} m²`]);
+      const volume = volumeOver(this.cells, points);
+      if (volume) rows.push(["volume over it", volumeSaid(volume)]);
+    }
+    const profile = steps.length ? profileOf(this.cells, points[points.length - 2], points[points.length - 1]) : null;
+    const hint = !this.isOn && !points.length ? "Length and profile of two clicks, area and volume of three or more."
       : points.length < 2 ? "Click surfaces of the map." : `Each end is exact to about a voxel, ${metres(this.voxelM)}.`;
-    fill(this.said, rows.length > 0 && facts(rows), h("p", { class: "hint" }, hint));
+    this.write(steps);
+    fill(this.said, rows.length > 0 && facts(rows), profile && profilePicture(profile), h("p", { class: "hint" }, hint));
     this.onChange();
   }
+}
+
+function riseOf(from: Vector3, to: Vector3): { rise: number; level: number } {
+  return { rise: to.z - from.z, level: Math.hypot(to.x - from.x, to.y - from.y) };
+}
+
+function volumeSaid({ volumeM3, covered }: { volumeM3: number; covered: number }): string {
+  return `${volumeM3.toFixed(volumeM3 < 1 ? 3 : 2)} m³${covered < 0.995 ? `; ${Math.round(100 * covered)} % of the area has a surface` : ""}`;
+}
+
+/** Highest surfaces along the last line; where nothing is shown it is open. */
+function profilePicture({ stepM, tops }: Profile): HTMLElement {
+  const known = [...tops].filter((top) => !Number.isNaN(top));
+  if (!known.length) return h("p", { class: "hint" }, "Nothing is shown along the line.");
+  const [low, high] = [Math.min(...known), Math.max(...known)];
+  const { width, height } = PROFILE;
+  const y = (top: number) => height - 4 - ((top - low) / Math.max(high - low, stepM)) * (height - 8);
+  const wide = width / tops.length;
+  const path = [...tops].map((top, n) => (Number.isNaN(top) ? "" : `M${(n * wide).toFixed(1)} ${y(top).toFixed(1)}h${wide.toFixed(2)}`)).join("");
+  const text = `Profile of ${metres(tops.length * stepM)}: surfaces from ${metres(low)} to ${metres(high)} in the map, ${metres(high - low)} apart`;
+  return h(
+    "figure", { class: "profile" }, svg("svg", { ...PROFILE, viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": text }, svg("path", { d: path })),
+    h("figcaption", { class: "hint" }, `${text}.`),
+  );
 }
 
 /** Of the polygon with these corners, m²: half the length of its vector area (Newell), so of its flattest picture. */

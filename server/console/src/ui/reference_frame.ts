@@ -92,7 +92,7 @@ function saidOf(picked: Picked, floorM: number | null): string {
 }
 
 /** The longest of 1, 2, 5, 10, ... m that is no longer. */
-function roundM(mostM: number): number {
+export function roundM(mostM: number): number {
   const ten = 10 ** Math.floor(Math.log10(mostM));
   const step = [5, 2, 1].find((one) => one * ten <= mostM) ?? 1;
   return Number((step * ten).toPrecision(1));

@@ -14,6 +14,8 @@ export class TopBar {
   onField: (field: Field) => void = () => {};
   onTheme: () => void = () => {};
   private readonly fields: HTMLElement;
+  /** The same where there is no room for buttons. */
+  private readonly field: HTMLSelectElement;
   private readonly link = h("span", { class: "link", role: "status" });
 
   constructor(maps: readonly MapInfo[], map: string, loggedIn: boolean, on: { map: (name: string) => void; keys: () => void; share: () => void; logOut: () => void }) {
@@ -25,21 +27,29 @@ export class TopBar {
         h("button", { type: "button", "data-field": field, onclick: () => this.onField(field) }, label),
       ),
     );
+    this.field = h("select", { class: "field", "aria-label": "Colour by" }, ...FIELDS.map(({ field, label }) => h("option", { value: field }, label)));
+    this.field.addEventListener("change", () => this.onField(this.field.value as Field));
+    const more = h("button", { type: "button", class: "more", title: "Share, theme, keys, log out", "aria-expanded": "false" }, "⋯");
     const button = (label: string, title: string, run: () => void) => h("button", { type: "button", title, onclick: run }, label);
     this.element = h(
       "header", { class: "bar" },
-      h("strong", { class: "brand" }, "cairn"), choice, this.fields, h("span", { class: "space" }), this.link,
-      button("Share", "A link that shows another person the same", on.share),
-      button("Theme", "Dark or light", () => {
-        toggleTheme();
-        this.onTheme();
-      }),
-      button("?", "Keys", on.keys),
-      loggedIn ? button("Log out", "Forget the token", on.logOut) : null,
+      h("h1", { class: "brand" }, "cairn"), choice, this.fields, this.field, h("span", { class: "space" }), this.link, more,
+      h(
+        "span", { class: "rare" },
+        button("Share", "A link that shows another person the same", on.share),
+        button("Theme", "Dark or light", () => {
+          toggleTheme();
+          this.onTheme();
+        }),
+        button("?", "Keys", on.keys),
+        loggedIn ? button("Log out", "Forget the token", on.logOut) : null,
+      ),
     );
+    more.addEventListener("click", () => more.setAttribute("aria-expanded", String(this.element.toggleAttribute("data-more"))));
   }
 
   showField(field: Field): void {
+    this.field.value = field;
     for (const button of this.fields.querySelectorAll("button")) {
       button.setAttribute("aria-pressed", String(button.dataset.field === field));
     }
