@@ -35,8 +35,8 @@ ROUND_RATIO = 1.35
 """Largest ratio of the axes of a disc on the board, as the places of its neighbours show it."""
 MISS_STEPS, MISS_PX = 0.1, 1.0
 """Largest distance of a disc from where those around it predict it, steps plus pixels."""
-BLOBS_ODD_MAX = 1.5
-"""Median of what `sound_discs` bounds by 1, at most, by blobs that are not fitted yet."""
+LIKELY_SHARE, LIKELY_ODD_MAX = 0.25, 2.0
+"""Share of a lattice's blobs that must look like discs before any is fitted, and the most of what is 1 for fits."""
 CORNERED, CORNERED_SIGMAS = 0.04, 5.0
 """Fourth harmonic along the lattice's axes that is no disc's, share of the radius: 0.11 for a square; and in sigmas."""
 BEYOND_SHARE = 0.5
@@ -119,10 +119,10 @@ def _oddness(board: Board, fits: Sequence[DiscFit | None], sound: Flags, shape: 
 
 
 def is_regular(lattice: Floats, found: Floats, ellipses: Floats, shape: tuple[int, ...], *, step: float) -> bool:
-    """True if at least half of a lattice's blobs look like discs of one board.
+    """True if at least a quarter of a lattice's blobs look like discs of one board.
 
-    Where they do not, no outline needs to be fitted. The bounds are those of `sound_discs`, but wider, since blobs are
-    not fitted.
+    Where they do not, no outline needs to be fitted. The bounds are those of `sound_discs`, but twice as wide, since
+    blobs are not fitted and one stray bends the predictions of all those around it.
 
     Args:
         lattice: (N, 2) places of blobs.
@@ -133,7 +133,7 @@ def is_regular(lattice: Floats, found: Floats, ellipses: Floats, shape: tuple[in
     """
     # Most lenses bend too little to matter here, and the straightening is the slow part.
     return any(
-        float(np.median(_oddness_in(view(), lattice, found, ellipses, step=step))) < BLOBS_ODD_MAX
+        bool((_oddness_in(view(), lattice, found, ellipses, step=step) < LIKELY_ODD_MAX).mean() >= LIKELY_SHARE)
         for view in (FlatView, lambda: bent_view(lattice, found, shape))
     )
 
