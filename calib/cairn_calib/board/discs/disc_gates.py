@@ -15,7 +15,7 @@ from cairn_calib.board.corners import Corners
 from cairn_calib.board.discs.disc_lattice import NamedDiscs
 from cairn_calib.board.discs.disc_outline import HARMONIC_SIGMAS, DiscFit, Outline
 from cairn_calib.board.discs.local_map import local_map, predicted_by_others
-from cairn_calib.board.discs.straightening import FlatView, View, bent_view
+from cairn_calib.board.discs.straightening import LatticeView, UnbentView, bent_view
 from cairn_map.arrays import Flags, Floats
 
 SEEN_MIN = 0.9
@@ -134,11 +134,11 @@ def is_regular(lattice: Floats, found: Floats, ellipses: Floats, shape: tuple[in
     # Most lenses bend too little to matter here, and the straightening is the slow part.
     return any(
         bool((_oddness_in(view(), lattice, found, ellipses, step=step) < LIKELY_ODD_MAX).mean() >= LIKELY_SHARE)
-        for view in (FlatView, lambda: bent_view(lattice, found, shape))
+        for view in (UnbentView, lambda: bent_view(lattice, found, shape))
     )
 
 
-def _oddness_in(view: View, lattice: Floats, found: Floats, ellipses: Floats, *, step: float) -> Floats:
+def _oddness_in(view: LatticeView, lattice: Floats, found: Floats, ellipses: Floats, *, step: float) -> Floats:
     """(N,) by how much each disc of a lattice is too large, too long or out of place; arguments as in `is_regular`.
 
     Infinite where the lattice is folded, or mirrored.

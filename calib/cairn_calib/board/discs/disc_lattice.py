@@ -176,6 +176,7 @@ def _walk(blobs: Blobs, near: _Neighbours, known: dict[Place, int]) -> dict[Plac
                 if guess is None:
                     continue
                 at, reach = guess
+                # Blobs that may be its neighbours at all.
                 if source not in likely:
                     length = near.mean_length(source)
                     apart = (length <= PITCH_RATIO * pitch) & (length >= pitch / PITCH_RATIO)
@@ -257,6 +258,7 @@ def name_discs(lattice: dict[Place, int], board: Board, centres: Floats, *, upri
     best: list[NamedDiscs] = []
     most = int(np.ceil(SEEN_MIN * board.count))
     for laid in _laid_boards(lattice, board):
+        # Places at which the board gains at least as much as at the best so far.
         for i, j in np.argwhere(laid.met - laid.beyond >= most):
             met, beyond = int(laid.met[i, j]), int(laid.beyond[i, j])
             if met - beyond < most:
@@ -302,10 +304,12 @@ def _laid_boards(lattice: dict[Place, int], board: Board) -> Iterator[_LaidBoard
     mine = lattice_of(board)
     for turn in TURNS:
         turned = mine @ turn
+        # Room for the board on all sides.
         span = np.ptp(turned, axis=0) + 1
         low = walked.min(axis=0) - span
         size = walked.max(axis=0) - low + span + 2
         there = np.full(size, -1, np.intp)
+        # Blobs at their places; elsewhere none.
         there[tuple((walked - low).T)] = list(lattice.values())
         zero = turned - turned.min(axis=0)
         ends = size - span

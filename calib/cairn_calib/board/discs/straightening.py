@@ -49,7 +49,7 @@ class Straightening:
         return np.asarray(1 + self.bend * (at**2).sum(axis=-1, keepdims=True))
 
 
-class View(Protocol):
+class LatticeView(Protocol):
     """A map from an image's pixels to places of a board's lattice."""
 
     def places(self, pixels: Floats) -> Floats:
@@ -62,7 +62,7 @@ class View(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class FlatView:
+class UnbentView:
     """The image itself: places are pixels."""
 
     def places(self, pixels: Floats) -> Floats:
