@@ -85,7 +85,10 @@ def merge(parts: Sequence[Blobs]) -> Blobs:
     shapes = np.concatenate([each.shapes for each in parts])
     heights = np.concatenate([each.heights for each in parts])
     radius = np.sqrt(np.abs(np.linalg.det(shapes)))
-    near = np.linalg.norm(centres[:, None] - centres[None], axis=2) < SAME_RADII * np.maximum(radius, radius[:, None])
+    # Component by component: NumPy sums over an axis of two twenty times as slowly.
+    x, y = centres.T
+    away = np.sqrt((x[:, None] - x) ** 2 + (y[:, None] - y) ** 2)
+    near = away < SAME_RADII * np.maximum(radius, radius[:, None])
     kept = ~(near & (heights > 2 * heights[:, None])).any(axis=1)
     for n in range(len(centres)):
         if kept[n]:
@@ -141,12 +144,12 @@ def _ellipse(contour: npt.NDArray[np.int32], D: Image, wide_px: float) -> tuple[
     determinant = xx * yy - xy * xy
     if determinant <= 0 or area < ELLIPSE_SHARE_MIN * 4 * np.pi * np.sqrt(determinant):
         return None
-    values, vectors = np.linalg.eigh([[xx, xy], [xy, yy]])
-    if values[0] < AXES_RATIO_MIN**2 * values[1]:
-        return None
     x, y, width, height = cv2.boundingRect(contour)
     # What the image's border cuts has no centre.
     if x <= 1 or y <= 1 or x + width >= D.shape[1] - 1 or y + height >= D.shape[0] - 1:
+        return None
+    values, vectors = np.linalg.eigh([[xx, xy], [xy, yy]])
+    if values[0] < AXES_RATIO_MIN**2 * values[1]:
         return None
     # An outline through the outer pixels' centres leaves half a pixel out on each side.
     axes = 2 * np.sqrt(values) + 0.5

@@ -15,7 +15,7 @@ from cairn_calib.board.corners import Corners
 from cairn_calib.board.discs.disc_lattice import NamedDiscs
 from cairn_calib.board.discs.disc_outline import HARMONIC_SIGMAS, DiscFit, Outline
 from cairn_calib.board.discs.local_map import local_map, predicted_by_others
-from cairn_calib.board.discs.straightening import bent_view
+from cairn_calib.board.discs.straightening import LatticeView, UnbentView, bent_view
 from cairn_map.arrays import Flags, Floats
 
 SEEN_MIN = 0.9
@@ -35,6 +35,8 @@ ROUND_RATIO = 1.35
 """Largest ratio of the axes of a disc on the board, as the places of its neighbours show it."""
 MISS_STEPS, MISS_PX = 0.1, 1.0
 """Largest distance of a disc from where those around it predict it, steps plus pixels."""
+LIKELY_SHARE, LIKELY_ODD_MAX = 0.25, 2.0
+"""Share of a lattice's blobs that must look like discs before any is fitted, and the most of what is 1 for fits."""
 CORNERED, CORNERED_SIGMAS = 0.04, 5.0
 """Fourth harmonic along the lattice's axes that is no disc's, share of the radius: 0.11 for a square; and in sigmas."""
 BEYOND_SHARE = 0.5
@@ -76,10 +78,12 @@ def neighbour_step(board: Board) -> float:
     return float(np.sqrt(2.0)) if board.pattern == "asymmetric-circles" else 1.0
 
 
-def sound_discs(board: Board, fits: Sequence[DiscFit | None], shape: tuple[int, ...]) -> Flags:
+def sound_discs(
+    board: Board, fits: Sequence[DiscFit | None], shape: tuple[int, ...], *, least: int = DISCS_MIN
+) -> Flags:
     """(N,) True for each fit that is a disc of this board: alike in contrast, crispness, size, roundness and place.
 
-    `shape` is that of the image.
+    Strays are sought until fewer than `least` discs are left. `shape` is that of the image.
     """
     there = np.array([each is not None for each in fits])
     if there.sum() < DISCS_MIN:
@@ -91,7 +95,7 @@ def sound_discs(board: Board, fits: Sequence[DiscFit | None], shape: tuple[int, 
         sound = there & (contrast > usual / CONTRAST_RATIO) & (contrast < usual * CONTRAST_RATIO)
         sound &= misfit < min(MISFIT_MAX, MISFIT_RATIO * float(np.nanmedian(misfit)) + MISFIT_SPARE)
     # Strays last, the worst first, since they spoil the predictions of those around them.
-    while sound.sum() >= DISCS_MIN:
+    while sound.sum() >= max(least, DISCS_MIN):
         off = _oddness(board, fits, sound, shape)
         worst = int(np.argmax(off))
         if off[worst] <= 1:
@@ -107,15 +111,45 @@ def _oddness(board: Board, fits: Sequence[DiscFit | None], sound: Flags, shape: 
     found, ellipses = (
         np.array(each) for each in zip(*((each.centroid, ellipse_of(each.outline)) for each in kept), strict=True)
     )
+    off = _oddness_in(bent_view(lattice, found, shape), lattice, found, ellipses, step=step)
+    result = np.zeros(len(sound))
+    # One that folds the lattice bends all predictions.
+    result[sound] = 9.0 if np.isinf(off).any() else off
+    return result
+
+
+def is_regular(lattice: Floats, found: Floats, ellipses: Floats, shape: tuple[int, ...], *, step: float) -> bool:
+    """True if at least a quarter of a lattice's blobs look like discs of one board.
+
+    Where they do not, no outline needs to be fitted. The bounds are those of `sound_discs`, but twice as wide, since
+    blobs are not fitted and one stray bends the predictions of all those around it.
+
+    Args:
+        lattice: (N, 2) places of blobs.
+        found: (N, 2) their centres, pixels.
+        ellipses: (N, 2, 2) their shapes, pixels.
+        shape: rows and columns of the image.
+        step: distance of neighbours on the lattice.
+    """
+    # Most lenses bend too little to matter here, and the straightening is the slow part.
+    return any(
+        bool((_oddness_in(view(), lattice, found, ellipses, step=step) < LIKELY_ODD_MAX).mean() >= LIKELY_SHARE)
+        for view in (UnbentView, lambda: bent_view(lattice, found, shape))
+    )
+
+
+def _oddness_in(view: LatticeView, lattice: Floats, found: Floats, ellipses: Floats, *, step: float) -> Floats:
+    """(N,) by how much each disc of a lattice is too large, too long or out of place; arguments as in `is_regular`.
+
+    Infinite where the lattice is folded, or mirrored.
+    """
     # On the board, as far as a homography and the lens's strongest bending say; parabolas follow the rest.
-    view = bent_view(lattice, found, shape)
     places, shrink = view.places(found), view.jacobian(found)
     _, steps = local_map(lattice, places, lattice, step=step)
-    # Folded, or mirrored.
-    if np.linalg.det(steps).min() < 1e-3 or not np.linalg.det(np.nan_to_num(shrink)).min() > 0:
-        return np.where(sound, 9.0, 0.0)
+    folded = ~(np.linalg.det(steps) >= 1e-3) | ~(np.linalg.det(np.nan_to_num(shrink)) > 0)
+    steps = np.where(folded[:, None, None], np.eye(2), steps)
     # The disc on the board: its image's ellipse in units of the steps there.
-    own = np.linalg.inv(np.swapaxes(steps, 1, 2)) @ shrink @ ellipses
+    own = np.linalg.inv(np.swapaxes(steps, 1, 2)) @ np.where(folded[:, None, None], np.eye(2), shrink) @ ellipses
     axes = np.linalg.svd(own, compute_uv=False)
     radius = np.sqrt(axes[:, 0] * axes[:, 1])
     size = np.exp(np.abs(np.log(radius / np.median(radius))))
@@ -126,9 +160,7 @@ def _oddness(board: Board, fits: Sequence[DiscFit | None], sound: Flags, shape: 
     off = np.maximum(off, miss / (MISS_STEPS * length + MISS_PX * pixel))
     low, high = DISC_PITCHES
     off = np.where((2 * radius > low * step) & (2 * radius < high * step), off, 9.0)
-    result = np.zeros(len(sound))
-    result[sound] = off
-    return result
+    return np.where(folded, np.inf, off)
 
 
 def ellipse_of(outline: Outline) -> Floats:
@@ -137,33 +169,62 @@ def ellipse_of(outline: Outline) -> Floats:
     return np.asarray(outline.shape @ ((1 + a0) * np.eye(2) + np.array([[a2, b2], [b2, -a2]])))
 
 
+def seen_min(in_view: int) -> int:
+    """Discs that must be seen of those wholly in view."""
+    return max(DISCS_MIN, int(np.ceil(SEEN_MIN * in_view)))
+
+
+def too_few_seen(seen: str, in_view: int) -> tuple[str, str]:
+    """The gate that refuses a grid of which too few discs are seen, and why; `seen` is their number, in words."""
+    return "discs", (
+        f"{seen} of the {in_view} discs in view have an outline like the others', at least {SEEN_MIN:.0%} must: "
+        "let nothing lie on the board, and let it be evenly warm or lit"
+    )
+
+
 def refusal(found: GridFit, named: NamedDiscs) -> tuple[str, str] | None:
     """The gate that refuses a grid, and why; None where all let it pass."""
     seen, in_view = int(found.kept.sum()), int(found.in_view.sum())
     board = found.board
-    if seen < max(DISCS_MIN, SEEN_MIN * in_view):
-        return "discs", (
-            f"{seen} of the {in_view} discs in view have an outline like the others', at least {SEEN_MIN:.0%} must: "
-            "let nothing lie on the board, and let it be evenly warm or lit"
-        )
+    if seen < seen_min(in_view):
+        return too_few_seen(str(seen), in_view)
     if seen < 0.5 * board.count:
-        return "discs", f"{seen} of {board.count} discs are wholly in view, at least half must be: move the board in"
+        return _too_few_in_view(seen, board)
     corners_sigmas = _cornered(found)
     if corners_sigmas is not None:
         return "roundness", (
             f"they have corners as squares have ({corners_sigmas:.0f} sigma): of a chessboard leave out --pattern"
         )
-    if narrow := _open_sides(found):
+    return place_refusal(board, found.in_view, named)
+
+
+def beyond_max(board: Board) -> float:
+    """Most discs of the same lattice that may lie next to a board's rim."""
+    return BEYOND_SHARE * min(board.columns, board.rows)
+
+
+def place_refusal(board: Board, in_view: Flags, named: NamedDiscs) -> tuple[str, str] | None:
+    """The gate that refuses a grid by its place in the image and in its lattice alone, and why; None where it may pass.
+
+    `in_view` is that of `GridFit`. No outline is needed, so that most lattices of clutter end here.
+    """
+    if (whole := int(in_view.sum())) < 0.5 * board.count:
+        return _too_few_in_view(whole, board)
+    if narrow := _open_sides(board, in_view):
         return "rims", (
             f"the {narrow} of the board are both cut by the image's border, so that it is open which discs these are: "
             "show at least one end of its rows and one of its columns"
         )
-    if named.beyond > BEYOND_SHARE * min(board.columns, board.rows):
+    if named.beyond > beyond_max(board):
         return "rims", (
             f"{named.beyond} more discs lie next to the board's rim in the same lattice: state the whole board with "
-            "--board, or cover what is not of it"
+            "--board, or cover what is not of it; of a chessboard leave out --pattern"
         )
     return None
+
+
+def _too_few_in_view(whole: int, board: Board) -> tuple[str, str]:
+    return "discs", f"{whole} of {board.count} discs are wholly in view, at least half must be: move the board in"
 
 
 def _cornered(found: GridFit) -> float | None:
@@ -191,10 +252,9 @@ def _cornered(found: GridFit) -> float | None:
     return float(sigmas) if sigmas > CORNERED_SIGMAS else None
 
 
-def _open_sides(found: GridFit) -> str | None:
+def _open_sides(board: Board, in_view: Flags) -> str | None:
     """Name of the two opposite sides that the image cuts; None where the board's place in the lattice is certain."""
-    board = found.board
-    cut = ~found.in_view.reshape(board.rows, board.columns)
+    cut = ~in_view.reshape(board.rows, board.columns)
     if cut[0].any() and cut[-1].any():
         return "first and last row"
     if cut[:, 0].any() and cut[:, -1].any():

@@ -19,10 +19,28 @@ from cairn_calib.board.board import Board, Polarity
 from cairn_calib.board.corner_detection import grey
 from cairn_calib.board.corners import BY_HAND, FOUND, Attempt, Detection, pointed_attempt
 from cairn_calib.board.discs.blobs import FINEST_PX, Blobs, blob_ladder, merge
-from cairn_calib.board.discs.disc_gates import DISCS_MIN, GridFit, disc_pitches, neighbour_step, refusal
-from cairn_calib.board.discs.disc_lattice import NamedDiscs, Place, lattice_of, name_discs, sides, walk_from, walks
+from cairn_calib.board.discs.disc_gates import (
+    DISCS_MIN,
+    GridFit,
+    disc_pitches,
+    is_regular,
+    neighbour_step,
+    place_refusal,
+    refusal,
+    seen_min,
+    too_few_seen,
+)
+from cairn_calib.board.discs.disc_lattice import (
+    NamedDiscs,
+    Place,
+    lattice_of,
+    name_discs,
+    sides,
+    walk_from,
+    walks,
+)
 from cairn_calib.board.discs.disc_outline import DiscFit
-from cairn_calib.board.discs.grid_outlines import fit_grid, grow, missing_in_view
+from cairn_calib.board.discs.grid_outlines import expect_grid, fit_grid, grow, missing_in_view
 from cairn_calib.board.discs.local_map import local_map
 from cairn_calib.board.homography import fit_homography, map_points
 from cairn_calib.board.polarity import PolarityCandidates
@@ -82,6 +100,11 @@ def _in_blobs(dark: Image, board: Board, blobs: Blobs, *, upright: bool) -> Grid
     best: tuple[str, str] | None = None
     largest = 0
     for walk in walks(blobs, board.count):
+        largest = max(largest, len(walk))
+        at = np.array(list(walk.values()), np.intp)
+        # Walks go from square to square, whatever the board's pattern: their step is 1.
+        if not is_regular(np.array(list(walk), np.float64), blobs.centres[at], blobs.shapes[at], dark.shape, step=1.0):
+            continue
         more, lattice = blobs, walk
         named = name_discs(walk, board, blobs.centres, upright=upright)
         if len(named) != 1 or not named[0].met.all() or named[0].beyond:
@@ -118,9 +141,17 @@ def _best_named(
             "open: show at least one more row and column, or the end of the board"
         )
     best = named[order[0]]
-    found = fit_grid(dark, board, blobs, best)
-    if found is None:
+    expected = expect_grid(board, blobs, best, dark.shape)
+    if expected is None:
         return None
+    # Fits are the slow part: what its place alone refuses, or too few discs, is not fitted to the end.
+    refused = place_refusal(board, expected.in_view, best)
+    if refused is not None:
+        return refused
+    in_view = int(expected.in_view.sum())
+    found = fit_grid(dark, expected, least=seen_min(in_view))
+    if found is None:
+        return too_few_seen(f"at most {seen_min(in_view) - 1}", in_view)
     return refusal(found, best) or found
 
 
@@ -179,7 +210,8 @@ def _at_pointed(dark: Image, board: Board, pointed: Floats) -> tuple[GridFit | N
     if len(pointed) == 4:
         own = _between(dark, board, blobs, own, homography)
     names = NamedDiscs(own, 0)
-    return fit_grid(dark, board, blobs, names), names
+    expected = expect_grid(board, blobs, names, dark.shape)
+    return None if expected is None else fit_grid(dark, expected), names
 
 
 def _meant(

@@ -44,6 +44,8 @@ STARTS_MAX = 60
 """Blobs from which a walk is tried."""
 SEEN_MIN = 0.5
 """Share of the board's discs that a walk must have met, at least."""
+ROOM_MIN = 0.25
+"""Share of the board's discs in a walk, at least, from which the rest can grow."""
 TURNS = tuple(np.array(turn) for turn in (((1, 0), (0, 1)), ((0, -1), (1, 0)), ((-1, 0), (0, -1)), ((0, 1), (-1, 0))))
 
 
@@ -98,15 +100,17 @@ class _Neighbours:
         self.blobs = blobs
         self.away = blobs.centres[None] - blobs.centres[:, None]
         # In each blob's own units: rows are seen from that blob.
-        self.own = np.einsum("nij,nmj->nmi", np.linalg.inv(blobs.shapes), self.away)
+        self.own = np.empty_like(self.away)
+        for row, (by_x, by_y) in enumerate(np.moveaxis(np.linalg.inv(blobs.shapes), 0, -1)):
+            self.own[..., row] = by_x[:, None] * self.away[..., 0] + by_y[:, None] * self.away[..., 1]
         # Neighbours are of about one size and height, and a pitch apart for both of them.
-        length = self.distance = np.linalg.norm(self.own, axis=2)
+        # Component by component: NumPy sums over an axis of two twenty times as slowly.
+        length = self.distance = np.sqrt(self.own[..., 0] ** 2 + self.own[..., 1] ** 2)
         area = np.linalg.det(blobs.shapes)
-        one_size = np.maximum(area[:, None] / area, area / area[:, None]) < AREA_RATIO
-        one_height = (
-            np.maximum(blobs.heights[:, None] / blobs.heights, blobs.heights / blobs.heights[:, None]) < HEIGHT_RATIO
+        areas, heights = area[:, None] / area, blobs.heights[:, None] / blobs.heights
+        self.alike = np.asarray(
+            (np.maximum(areas, areas.T) < AREA_RATIO) & (np.maximum(heights, heights.T) < HEIGHT_RATIO)
         )
-        self.alike = one_size & one_height
         apart = (length > PITCH_RADII[0]) & (length < PITCH_RADII[1])
         self.length = np.where(self.alike & apart & apart.T, length, np.inf)
 
@@ -118,8 +122,9 @@ class _Neighbours:
         """Blobs by how well their four nearest neighbours make a cross, best first."""
         if len(self.length) < 5:
             return np.arange(len(self.length))
-        order = np.argsort(self.length, axis=1)[:, :4]
-        rows = np.arange(len(order))[:, None]
+        rows = np.arange(len(self.length))[:, None]
+        order = np.argpartition(self.length, 3, axis=1)[:, :4]
+        order = order[rows, np.argsort(self.length[rows, order], axis=1)]
         length = self.length[rows, order]
         steps = self.own[rows, order]
         with np.errstate(invalid="ignore"):
@@ -157,6 +162,7 @@ def _walk(blobs: Blobs, near: _Neighbours, known: dict[Place, int]) -> dict[Plac
     pitch = float(np.median(lengths)) if lengths else np.inf
     taken = set(lattice.values())
     open_places = list(lattice)
+    likely: dict[int, Indices] = {}
     # Invariant: each place has one blob, each blob one place.
     while open_places:
         found: list[tuple[float, Place, int, int]] = []
@@ -170,12 +176,18 @@ def _walk(blobs: Blobs, near: _Neighbours, known: dict[Place, int]) -> dict[Plac
                 if guess is None:
                     continue
                 at, reach = guess
-                miss = np.linalg.norm(blobs.centres - at, axis=1) / reach
-                length = near.mean_length(source)
-                miss[~near.alike[source] | (length > PITCH_RATIO * pitch) | (length < pitch / PITCH_RATIO)] = np.inf
-                nearest = int(np.argmin(miss))
-                if miss[nearest] < REACH and nearest not in taken:
-                    found.append((float(miss[nearest]), to, nearest, source))
+                # Blobs that may be its neighbours at all.
+                if source not in likely:
+                    length = near.mean_length(source)
+                    apart = (length <= PITCH_RATIO * pitch) & (length >= pitch / PITCH_RATIO)
+                    likely[source] = np.flatnonzero(near.alike[source] & apart)
+                if not len(likely[source]):
+                    continue
+                miss = np.linalg.norm(blobs.centres[likely[source]] - at, axis=1) / reach
+                best = int(np.argmin(miss))
+                nearest = int(likely[source][best])
+                if miss[best] < REACH and nearest not in taken:
+                    found.append((float(miss[best]), to, nearest, source))
         # The surest first: a blob and a place are given away once.
         open_places = []
         for _, to, blob, _ in sorted(found):
@@ -242,43 +254,76 @@ def name_discs(lattice: dict[Place, int], board: Board, centres: Floats, *, upri
     None where no turn and place meets half of the board. With `upright`, the board's rows run within 90 degrees of the
     image's rows, to the right; of a square board within 45.
     """
-    # Both as whole numbers on the square lattice.
-    walked = np.array(list(lattice), np.intp)
-    blobs = np.array([lattice[place] for place in lattice], np.intp)
-    mine = lattice_of(board)
     is_square = board.pattern == "circles" and board.columns == board.rows
     best: list[NamedDiscs] = []
     most = int(np.ceil(SEEN_MIN * board.count))
+    for laid in _laid_boards(lattice, board):
+        # Places at which the board gains at least as much as at the best so far.
+        for i, j in np.argwhere(laid.met - laid.beyond >= most):
+            met, beyond = int(laid.met[i, j]), int(laid.beyond[i, j])
+            if met - beyond < most:
+                continue
+            named = laid.blobs[laid.places[:, 0] + i, laid.places[:, 1] + j]
+            right, down = _rows_direction(named, board, centres)
+            is_leaning = right <= abs(down)
+            if upright and (right <= 0 or (is_leaning and is_square)):
+                continue
+            best = [each for each in best if int(each.met.sum()) - each.beyond >= met - beyond]
+            most = met - beyond
+            best.append(NamedDiscs(named, beyond, is_leaning))
+    return best
+
+
+def has_room(lattice: dict[Place, int], board: Board, *, beyond_max: float) -> bool:
+    """True if the board can be laid on some of a lattice with at most `beyond_max` discs next to its rim.
+
+    A lattice that grows only gains discs: where it has no room for the board, it will have none.
+    """
+    least = np.ceil(ROOM_MIN * board.count)
+    return any(bool(((laid.met >= least) & (laid.beyond <= beyond_max)).any()) for laid in _laid_boards(lattice, board))
+
+
+@dataclass(frozen=True, slots=True)
+class _LaidBoard:
+    """A board in one turn on the grid of a walked lattice, which leaves room for it on all sides."""
+
+    blobs: Indices
+    """(A, B) blob at each place of the grid, or -1."""
+    places: Indices
+    """(N, 2) of the board's points on the grid where it is laid at (0, 0)."""
+    met: Indices
+    """Number of discs under the board where it is laid at (i, j)."""
+    beyond: Indices
+    """Number of discs next to its rim there."""
+
+
+def _laid_boards(lattice: dict[Place, int], board: Board) -> Iterator[_LaidBoard]:
+    """The board on a lattice, in all turns."""
+    # Both as whole numbers on the square lattice.
+    walked = np.array(list(lattice), np.intp)
+    mine = lattice_of(board)
     for turn in TURNS:
         turned = mine @ turn
-        # An occupied grid, with room for the board on all sides.
+        # Room for the board on all sides.
         span = np.ptp(turned, axis=0) + 1
         low = walked.min(axis=0) - span
         size = walked.max(axis=0) - low + span + 2
         there = np.full(size, -1, np.intp)
-        there[tuple((walked - low).T)] = blobs
+        # Blobs at their places; elsewhere none.
+        there[tuple((walked - low).T)] = list(lattice.values())
         zero = turned - turned.min(axis=0)
-        rim = _rim(zero)
-        for i in range(size[0] - span[0]):
-            for j in range(size[1] - span[1]):
-                # The blobs under the board, laid at (i, j) in this turn.
-                named = there[zero[:, 0] + i, zero[:, 1] + j]
-                met = int((named >= 0).sum())
-                if met < most:
-                    continue
-                at = rim + np.array([i, j])
-                inside = ((at >= 0) & (at < size)).all(axis=1)
-                beyond = int((there[tuple(at[inside].T)] >= 0).sum())
-                if met - beyond < most:
-                    continue
-                right, down = _rows_direction(named, board, centres)
-                is_leaning = right <= abs(down)
-                if upright and (right <= 0 or (is_leaning and is_square)):
-                    continue
-                best = [each for each in best if int(each.met.sum()) - each.beyond >= met - beyond]
-                most = met - beyond
-                best.append(NamedDiscs(named, beyond, is_leaning))
-    return best
+        ends = size - span
+        yield _LaidBoard(there, zero, _count_at(there, zero, ends), _count_at(there, _rim(zero), ends))
+
+
+def _count_at(there: Indices, places: Indices, ends: Indices) -> Indices:
+    """Number of discs at places moved by (i, j) < `ends`; places may be one row or column outside of the grid."""
+    # One shifted copy of the grid for each place: a loop over the places, not over the moves.
+    grid = np.pad(there >= 0, 1).astype(np.int32)
+    found = np.zeros(ends, np.intp)
+    for x, y in places + 1:
+        found += grid[x : x + ends[0], y : y + ends[1]]
+    return found
 
 
 def _rim(places: npt.NDArray[np.intp]) -> npt.NDArray[np.intp]:

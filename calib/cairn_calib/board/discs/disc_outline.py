@@ -15,7 +15,7 @@ outline by, over what independent noise would: edges that are ragged, or a blur 
 less certain.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from math import erf
 
@@ -118,23 +118,30 @@ def fit_outlines(dark: Image, outlines: Sequence[Outline | None]) -> list[DiscFi
 
     Each disc is fitted alone, then again without what the blur of its neighbours adds to its ground.
     """
-    first: list[DiscFit | None] = []
+    first = list(fits_alone(dark, outlines))
+    again = dict(fits_again(dark, first))
+    return [again.get(n) for n in range(len(first))]
+
+
+def fits_alone(dark: Image, outlines: Sequence[Outline | None]) -> Iterator[DiscFit | None]:
+    """The first fits of `fit_outlines`, in order."""
     for own in outlines:
         others = [other for other in outlines if other is not None and other is not own]
         # A blob is mostly near enough; where its edge is too far off, a wide blur sees it.
-        first.append(None if own is None else _fit(dark, own, others, []) or fit_outline(dark, own, others))
+        yield None if own is None else _fit(dark, own, others, []) or fit_outline(dark, own, others)
+
+
+def fits_again(dark: Image, first: Sequence[DiscFit | None]) -> Iterator[tuple[int, DiscFit]]:
+    """The second fits of `fit_outlines`, each with its index in the first ones: the worst of these first."""
     found = [each for each in first if each is not None]
     if not found:
-        return first
+        return
     # One lens, one blur: the usual one starts the second fit.
     blur = float(np.median([each.outline.blur_px for each in found]))
     centres = np.array([each.outline.centre for each in found])
     reaches = np.array([each.outline.reach_px() for each in found])
-    again: list[DiscFit | None] = []
-    for each in first:
-        if each is None:
-            again.append(None)
-            continue
+    there = [(n, each) for n, each in enumerate(first) if each is not None]
+    for index, each in sorted(there, key=lambda pair: -pair[1].misfit):
         # Neighbours whose blur reaches into this band; most are farther off than any outline reaches.
         start = replace(each.outline, blur_px=blur)
         widest, reach = 2 * (BAND_BLURS * blur + BAND_PX), each.outline.reach_px()
@@ -144,8 +151,7 @@ def fit_outlines(dark: Image, outlines: Sequence[Outline | None]) -> list[DiscFi
             for n in np.flatnonzero(away < widest + reach + reaches).tolist()
             if found[n] is not each and _gap_px(each, found[n]) < widest
         ]
-        again.append(_fit(dark, start, [], near) or each)
-    return again
+        yield index, _fit(dark, start, [], near) or each
 
 
 def fit_outline(dark: Image, start: Outline, others: Sequence[Outline]) -> DiscFit | None:

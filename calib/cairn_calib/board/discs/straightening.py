@@ -9,6 +9,7 @@ the rest.
 """
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -46,6 +47,31 @@ class Straightening:
 
     def _denominator(self, at: Floats) -> Floats:
         return np.asarray(1 + self.bend * (at**2).sum(axis=-1, keepdims=True))
+
+
+class LatticeView(Protocol):
+    """A map from an image's pixels to places of a board's lattice."""
+
+    def places(self, pixels: Floats) -> Floats:
+        """(N, 2) places."""
+        ...
+
+    def jacobian(self, pixels: Floats) -> Floats:
+        """(N, 2, 2) derivatives of the places by the pixels."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class UnbentView:
+    """The image itself: places are pixels."""
+
+    def places(self, pixels: Floats) -> Floats:
+        """(N, 2) places."""
+        return pixels
+
+    def jacobian(self, pixels: Floats) -> Floats:
+        """(N, 2, 2) derivatives of the places by the pixels."""
+        return np.broadcast_to(np.eye(2), (len(pixels), 2, 2))
 
 
 @dataclass(frozen=True, slots=True)
