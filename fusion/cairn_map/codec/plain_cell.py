@@ -115,7 +115,10 @@ def plain_content(head: CellHead, head_bytes: bytes, raw: Mapping[int, bytes], *
 
 
 def plain_bytes(key: CellKey, evidence: Evidence, geometry: Geometry) -> PlainBytes | None:
-    """Canonical bytes of packed evidence that fits the geometry (`check_fits`); None if it is signed."""
+    """Canonical bytes of packed evidence that fits the geometry (`check_fits`); None of signed evidence, and of classes."""
+    kinds = tuple(channel.kind for channel in geometry.channels)
+    if ChannelKind.CLASSES in kinds:
+        return None
     # One kind of array, whatever the evidence was made of: each other kind is another kernel to compile.
     voxels, counts = _readable(evidence.voxels), _readable(evidence.counts)
     sampled, samples = _readable(evidence.sampled), _readable(evidence.samples)
@@ -136,7 +139,7 @@ def plain_bytes(key: CellKey, evidence: Evidence, geometry: Geometry) -> PlainBy
     rows, bits = np.zeros(len(spec), np.int64), np.zeros(geometry.plane_count, np.uint64)
     if not stream_kernels.sample_words_into(leaf_rows, sampled, samples, spec, presence, words, rows, bits):
         return None
-    numbers = _numbers(tuple(channel.kind for channel in geometry.channels))
+    numbers = _numbers(kinds)
     size, planes = _sizes(masks, leaves, count_bits, presence.shape[1], spec, rows, bits)
     head = encode_head(
         CellHead(key=key, geometry=geometry, voxels=V, leaves=leaves, streams=len(numbers), signed=False)
