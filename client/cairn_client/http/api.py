@@ -52,7 +52,7 @@ from cairn_map.wire.change_messages import ChangesAnswer
 from cairn_map.wire.frames import FRAME_BYTES_MAX, JSON_BYTES_MAX, Frame
 from cairn_map.wire.hot_spot_messages import HotSpotsAnswer
 from cairn_map.wire.hottest_messages import HottestAnswer
-from cairn_map.wire.layer_messages import CLASSES_FORMAT, AddLayer, LayerAdded, LayerInfo
+from cairn_map.wire.layer_messages import KINDS_FORMAT, AddLayer, LayerAdded, LayerInfo
 from cairn_map.wire.mark_messages import AttachmentState, MarkPage, MarkReceipt, MarkRequest, WantedAttachments
 from cairn_map.wire.messages import (
     INDEX_PAGE,
@@ -85,7 +85,7 @@ if TYPE_CHECKING:
     import httpx
 
 PROTOCOL_VERSION = "1"
-FORMAT_VERSION = str(CLASSES_FORMAT)
+FORMAT_VERSION = str(KINDS_FORMAT)
 """Newest version of cells and commits that is read; without it a server takes a client for one of version 1."""
 TIMEOUT_S, CONNECT_S = 30.0, 5.0
 NO_CONTENT, NOT_MODIFIED = 204, 304

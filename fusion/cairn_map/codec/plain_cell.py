@@ -115,7 +115,7 @@ def plain_content(head: CellHead, head_bytes: bytes, raw: Mapping[int, bytes], *
 
 
 def plain_bytes(key: CellKey, evidence: Evidence, geometry: Geometry) -> PlainBytes | None:
-    """Canonical bytes of packed evidence that fits the geometry (`check_fits`); None of signed evidence, and of classes."""
+    """Canonical bytes of packed evidence that fits the geometry (`check_fits`); None if it is signed, or of classes."""
     kinds = tuple(channel.kind for channel in geometry.channels)
     if ChannelKind.CLASSES in kinds:
         return None

@@ -11,8 +11,8 @@ from cairn_map.wire.messages import IdText, MapInfo, MapNameText
 
 LAYER_FORMAT = 4
 """`Cairn-Format` from which on a client knows of layers: to others a server names none in its list of maps."""
-CLASSES_FORMAT = 5
-"""The same of layers with a channel of classes, in lists of maps and of layers."""
+KINDS_FORMAT = 5
+"""`Cairn-Format` from which on a client knows channels of classes, flat voxels, and when log entries were received."""
 
 
 class _Model(BaseModel):
@@ -61,8 +61,9 @@ class LayerAdded(_Model):
 
 
 def is_listed(geometry: Geometry, known: int) -> bool:
-    """True if a client of a `Cairn-Format` can read the grid of a layer; others refuse a whole list for one channel."""
-    return known >= CLASSES_FORMAT or all(channel.kind is not ChannelKind.CLASSES for channel in geometry.channels)
+    """True if a client of a `Cairn-Format` can read the grid of a layer; others refuse a whole list for one layer."""
+    has_classes = any(channel.kind is ChannelKind.CLASSES for channel in geometry.channels)
+    return known >= KINDS_FORMAT or not (has_classes or geometry.is_flat)
 
 
 def layer_info(info: MapInfo) -> LayerInfo:

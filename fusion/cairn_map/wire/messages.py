@@ -4,7 +4,7 @@ Fields that hold cursors, fingerprints or version vectors carry their text forms
 messages of tokens and the audit log are in `access_messages`, those of live streams in `live_events`.
 """
 
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Literal, Self, TypeVar
 
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, FailFast, Field, ValidationError, model_validator
@@ -394,8 +394,12 @@ class LogEntry(_Model):
     note: Annotated[str, Field(max_length=1024)] = ""
     """Note of its author; empty, too, once its evidence is not kept."""
     pushed_s: Annotated[float | None, Field(exclude_if=lambda value: value is None)] = None
-    """Time at which this server received the commit, UTC seconds since 1970; None: the server is of before."""
+    """Time at which this server received the commit, UTC seconds since 1970; None: it is left out."""
     pushed_utc: UtcText = None
+
+    def without_receipt(self) -> Self:
+        """The entry as clients of `Cairn-Format` 4 and below know it: they refuse a field that is new to them."""
+        return self.model_copy(update={"pushed_s": None})
 
     @property
     def names(self) -> int:

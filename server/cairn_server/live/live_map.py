@@ -139,7 +139,8 @@ class LiveChanges:
             head = self._head
             if head is None or head.seq <= seen.seq or losses != self._losses:
                 return [], seen
-            entries = [entry for entry in self._entries if entry.seq > seen.seq]
+            # A listener does not say what it knows, and it hears of an entry as it comes.
+            entries = [entry.without_receipt() for entry in self._entries if entry.seq > seen.seq]
             marks = [change for change in self._marks if change.seq > seen.seq]
             has_all_marks = seen.seq >= self._marks_floor
             cells: list[tuple[int, int, int, int]] = []

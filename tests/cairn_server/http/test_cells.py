@@ -176,8 +176,10 @@ def test_log_entries_tell_their_parent_and_what_their_author_had_seen(live: Live
         live.push(made, commit)
     live.push(made, make_commit(meta.model_copy(update={"retracts": (str(first.id),)}), {}, made.geometry))
     live.folded(made)
-    entries = live.http.get(f"/maps/{made.name}/log").json()
+    entries = live.http.get(f"/maps/{made.name}/log", headers={"Cairn-Format": "5"}).json()
     assert [(entry["parent"], entry["seen"]) for entry in entries][:2] == [(None, None), (first.sha.hex(), seen)]
     assert [entry["place_m"] for entry in entries] == [[0.0, 0.0, 0.4]] * len(entries)
     assert all(abs(entry["pushed_s"] - time.time()) < 600 for entry in entries), "when the server received each"
     assert all(entry["pushed_utc"].endswith("Z") for entry in entries)
+    for entry in live.http.get(f"/maps/{made.name}/log", headers={"Cairn-Format": "4"}).json():
+        assert not {"pushed_s", "pushed_utc"} & entry.keys(), "which clients of before refuse"

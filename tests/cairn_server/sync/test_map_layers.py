@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.fixtures.map.classed import CLASSED
 from tests.fixtures.map.layers import FINE, layer_commit
 from tests.fixtures.map.made import SMALL
 from tests.fixtures.map.marks import mark, mark_commit
@@ -16,7 +17,7 @@ from tests.fixtures.server.pushes import MOLE, pushed, read, sum_of
 from tests.fixtures.server.stores import one_server
 
 from cairn_map.epochs.layer import LAYERS_MAX
-from cairn_map.evidence.grid import Geometry
+from cairn_map.evidence.grid import Geometry, level_geometry
 from cairn_map.wire.layer_messages import LayerAdded, LayerInfo
 from cairn_server.store.store_rows import MapRow
 
@@ -165,6 +166,16 @@ def test_a_list_of_maps_names_layers_to_clients_that_know_of_them_alone(live: Li
     assert names(KNOWS_LAYERS) == [row.name, f"{row.name}.fine"]
     for headers in ({}, {"Cairn-Format": "2"}):
         assert names(headers) == [row.name]
+
+
+@pytest.mark.parametrize("geometry", [CLASSED, level_geometry()], ids=["classes", "level"])
+def test_a_layer_that_a_client_cannot_read_is_in_none_of_its_lists(live: Live, geometry: Geometry) -> None:
+    row = live.new_map()
+    assert add(live, row, "new", geometry).status_code == 201
+    for path in ("/maps", f"/maps/{row.name}/layers"):
+        answers = [live.http.get(path, headers={"Cairn-Format": known}).json() for known in ("4", "5")]
+        names = [{each.get("map", each["name"]) for each in answer} for answer in answers]
+        assert (f"{row.name}.new" in names[0], f"{row.name}.new" in names[1]) == (False, True)
 
 
 def test_operators_add_layers_readers_list_them_and_robots_only_map(guarded: Live) -> None:

@@ -6,7 +6,7 @@ from fastapi import APIRouter, Depends, Query, Response
 
 from cairn_map.commits.commit import EPOCH_VERSION
 from cairn_map.errors import BadInputError
-from cairn_map.wire.layer_messages import LAYER_FORMAT, AddLayer, LayerAdded, LayerInfo, is_listed
+from cairn_map.wire.layer_messages import KINDS_FORMAT, LAYER_FORMAT, AddLayer, LayerAdded, LayerInfo, is_listed
 from cairn_map.wire.live_events import NAMES_MAX
 from cairn_map.wire.mark_messages import PAGE_MAX, MarkPage, MarkReceipt, MarkRequest
 from cairn_map.wire.messages import CreateMap, LogEntry, MapDeleted, MapInfo, MapSizes, Retract, Retracted
@@ -147,12 +147,16 @@ def log(
     service: Operations,
     row: Map,
     times: Times,
+    known: Format,
     after: Annotated[int, Query(ge=0, lt=1 << 63)] = 0,
     limit: Annotated[int, Query(ge=1, le=LOG_PAGE_MAX)] = 100,
 ) -> list[LogEntry]:
     """Log entries, oldest first."""
     with service.store.snapshot(row) as snapshot:
-        return [times(entry) for entry in snapshot.log(after_seq=after, limit=limit, names_max=NAMES_MAX)]
+        entries = snapshot.log(after_seq=after, limit=limit, names_max=NAMES_MAX)
+    if known < KINDS_FORMAT:
+        entries = [entry.without_receipt() for entry in entries]
+    return [times(entry) for entry in entries]
 
 
 @router.get("/maps/{name}/main/marks", dependencies=READERS)
