@@ -18,7 +18,7 @@ SLACK = 1.15
 PLANS = 20
 MADE_AGAIN = f"""(() => {{
   const before = [...c.cells.all.values()].map(({{ wanted }}) => wanted).join();
-  for (let n = 0; n < {PLANS}; n++) c.plan();
+  for (let n = 0; n < {PLANS}; n++) c.replan();
   return [...c.cells.all.values()].map(({{ wanted }}) => wanted).join() === before && !c.cells.isFetching;
 }})()"""
 DEPTHS = "[...c.cells.all.values()].filter(({ count }) => count).map(({ depth }) => depth)"
@@ -69,7 +69,7 @@ def test_a_campus_comes_to_rest_and_all_of_it_is_shown(console: Console) -> None
 def test_cells_become_coarser_before_any_is_left_out(console: Console) -> None:
     before, least = console.tell("c.cells.drawn"), min(console.tell(DEPTHS))
     assert before > SLACK * BUDGET
-    console.tell(f"(c.cells.budget = {BUDGET}, c.plan())")
+    console.tell(f"(c.cells.budget = {BUDGET}, c.replan())")
     console.settled()
     assert console.tell("c.cells.drawn") <= SLACK * BUDGET
     assert console.tell(UNSHOWN) == 0
@@ -78,7 +78,7 @@ def test_cells_become_coarser_before_any_is_left_out(console: Console) -> None:
 
 
 def test_cells_without_room_are_counted_in_words(console: Console) -> None:
-    console.tell(f"(c.cells.budget = {TINY}, c.plan())")
+    console.tell(f"(c.cells.budget = {TINY}, c.replan())")
     console.settled()
     left = console.tell(UNSHOWN)
     assert 0 < left < CELLS

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 from playwright.sync_api import Browser, Route
-from tests.console.browsing import SMALL_VIEW, Console, tab
+from tests.console.browsing import VIEW, Console, tab
 from tests.console.room import Room
 from tests.fixtures.map.made import SMALL, surface_evidence
 from tests.fixtures.server.live import until
@@ -96,7 +96,7 @@ def console(chromium: Browser, room: Room) -> Iterator[Console]:
                 until(lambda: len(log_of(api)) == 1 + RETRACTS, "the retracts are folded")
         until(lambda: len(log_of(api)) == LOG, "all commits are folded")
         assert len(api.log(LONG, limit=1000)) < 1 + RETRACTS, "a page ends early"
-    with chromium.new_context(viewport=SMALL_VIEW) as context:  # type: ignore[arg-type]
+    with chromium.new_context(viewport=VIEW) as context:  # type: ignore[arg-type]
         found = tab(context, room)
         found.open(f"#map={LONG}")
         found.log_in()

@@ -233,7 +233,7 @@ def test_what_a_retract_takes_out_is_coloured_in_the_map_before(console: Console
     assert serious(console, "preview") == []
     page.keyboard.press("Escape")
     page.get_by_role("dialog").wait_for(state="detached")
-    assert console.tell("c.time.preview.voxels.count") == 0
+    console.until("c.time.preview.voxels.count === 0", "the colours are gone")
     page.get_by_role("button", name=f"commit {crate}").click()
     page.get_by_role("button", name="Show what that takes out").click()
     page.get_by_text("voxels red: goes").wait_for()

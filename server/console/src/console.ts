@@ -19,6 +19,7 @@ import { Picker } from "./scene/picking.ts";
 import { Spread } from "./scene/spread.ts";
 import { Stage } from "./scene/stage.ts";
 import { Walker } from "./scene/walker.ts";
+import { serverNowS } from "./server_time.ts";
 import { Team } from "./team.ts";
 import { TimeDesk } from "./time_desk.ts";
 import { CameraPanel } from "./ui/camera_panel.ts";
@@ -396,8 +397,10 @@ export class Console {
         this.replan();
       }
     } else if (event.type === "log") {
-      this.book.add(event.entries);
-      this.strip.add(event.entries);
+      // Events leave out when the server received them, which was just now.
+      const entries = event.entries.map((entry) => ({ ...entry, pushed_s: entry.pushed_s ?? serverNowS() }));
+      this.book.add(entries);
+      this.strip.add(entries);
       if (event.left_out) void this.readLog(event.entries[event.entries.length - 1].seq, event.left_out + event.entries.length).catch(() => this.reload());
       this.team.refresh();
     } else if (event.type === "robot") {

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from cairn_calib.board.board import Board
 from cairn_calib.board.corners import Corners
@@ -17,6 +18,8 @@ from cairn_calib.board.discs.disc_outline import HARMONIC_SIGMAS, DiscFit, Outli
 from cairn_calib.board.discs.local_map import local_map, predicted_by_others
 from cairn_calib.board.discs.straightening import LatticeView, UnbentView, bent_view
 from cairn_map.arrays import Flags, Floats
+
+Image = npt.NDArray[np.float32]
 
 SEEN_MIN = 0.9
 """Share of the discs wholly in view that must be seen."""
@@ -41,6 +44,9 @@ CORNERED, CORNERED_SIGMAS = 0.04, 5.0
 """Fourth harmonic along the lattice's axes that is no disc's, share of the radius: 0.11 for a square; and in sigmas."""
 BEYOND_SHARE = 0.5
 """Share of the places along a side of the board at which discs of the same lattice make it part of a larger pattern."""
+SQUARES_SHARE, HALF_WAY = 0.9, 0.08
+"""Share of the places next to a board's rim that are as dark as discs where these are squares of a chessboard; and by
+how much its corners, half-way between two squares of one colour, may differ from the mean of both colours."""
 DISC_PITCHES = (0.25, 1.0)
 """Diameter of a disc, pitches (of asymmetric circles: distances of neighbours)."""
 
@@ -196,6 +202,41 @@ def refusal(found: GridFit, named: NamedDiscs) -> tuple[str, str] | None:
             f"they have corners as squares have ({corners_sigmas:.0f} sigma): of a chessboard leave out --pattern"
         )
     return place_refusal(board, found.in_view, named)
+
+
+def squares_refusal(dark: Image, found: GridFit) -> tuple[str, str] | None:
+    """The gate that refuses squares of a chessboard that are too small to have corners, and why; None of discs.
+
+    The outer squares run into the margin of their board, so that the lattice ends there, but what is beyond its rim is
+    as dark as they are. In between are corners: the mean of both colours, however blurred the image is.
+    """
+    board, step = found.board, neighbour_step(found.board)
+    known, pixels = board.lattice()[found.kept], found.pixels[found.kept]
+    # Its neighbours, one after the other round a disc.
+    sides = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)] if step > 1 else [(1, 0), (0, 1), (-1, 0), (0, -1)])
+    # Counts at discs, at the ground between four of them, half-way to each neighbour, and beyond the rim.
+    near = (known[:, None] + sides).reshape(-1, 2)
+    is_disc = (np.abs(near[:, None] - board.lattice()).max(axis=2) < 1e-6).any(axis=1)
+    ground = (known[:, None] + (sides + np.roll(sides, 1, axis=0)) / 2).reshape(-1, 2)
+    half_way = np.repeat(known, len(sides), axis=0)[is_disc] + np.tile(sides, (len(known), 1))[is_disc] / 2
+    values = [
+        _counts_at(dark, local_map(known, pixels, places, step=step)[0])
+        for places in (known, ground, half_way, near[~is_disc])
+    ]
+    if any(not len(each) for each in values):
+        return None
+    disc, between = float(np.median(values[0])), float(np.median(values[1]))
+    corner, beyond = ((each - between) / (disc - between) if disc != between else each * 0 for each in values[2:])
+    if (beyond > 0.5).mean() < SQUARES_SHARE or abs(float(np.median(corner)) - 0.5) > HALF_WAY:
+        return None
+    return "rims", "what lies beyond the board's rim is like its discs: of a chessboard leave out --pattern"
+
+
+def _counts_at(image: Image, pixels: Floats) -> Floats:
+    """Counts of the nearest pixels to those of (N, 2) that lie in an image."""
+    x, y = np.rint(pixels).astype(np.intp).T
+    inside = (x >= 0) & (y >= 0) & (x < image.shape[1]) & (y < image.shape[0])
+    return np.asarray(image[y[inside], x[inside]], np.float64)
 
 
 def beyond_max(board: Board) -> float:

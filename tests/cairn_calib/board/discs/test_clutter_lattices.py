@@ -1,5 +1,6 @@
 """Lattices that clutter makes are refused before any outline is fitted, which is what takes long."""
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -26,6 +27,24 @@ def ceiling(columns: int, rows: int) -> npt.NDArray[np.uint8]:
     y, x = np.mgrid[: 20 * rows, : 20 * columns]
     values = 190 - 130 / (1 + np.exp(np.hypot(x % 20 - 9.5, y % 20 - 9.5) - 6))
     return np.pad(values + np.random.default_rng(0).normal(0, 2, values.shape), 20, mode="edge").astype(np.uint8)
+
+
+def small_chessboard(edge_px: int, blur_px: float) -> npt.NDArray[np.float32]:
+    """A chessboard whose outer bright squares run into its margin: 15 others are left, as asymmetric circles lie."""
+    board = np.ones((9, 10))
+    board[1:-1, 1:-1] = np.indices((7, 8)).sum(axis=0) % 2 == 0
+    image = np.full((144, 176), 110.0)
+    image[40 : 40 + 9 * edge_px, 50 : 50 + 10 * edge_px] = 60 + 100 * np.kron(board, np.ones((edge_px, edge_px)))
+    noise = np.random.default_rng(1).normal(0, 1, image.shape)
+    return (cv2.GaussianBlur(image, (0, 0), blur_px) + noise).astype(np.float32)
+
+
+@pytest.mark.parametrize(("edge_px", "blur_px"), [(6, 1.5), (7, 2.0), (8, 2.0)])
+def test_squares_too_small_to_have_corners_are_no_discs(edge_px: int, blur_px: float) -> None:
+    board = Board(pattern="asymmetric-circles", columns=3, rows=5, pitch_m=0.05)
+    detection = find_circles(small_chessboard(edge_px, blur_px), board, polarity="reversed")
+    assert detection.corners is None
+    assert any("like its discs: of a chessboard" in each.reason for each in detection.attempts)
 
 
 @pytest.fixture
