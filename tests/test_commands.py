@@ -7,6 +7,8 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import chdir
+from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +20,8 @@ from tests.fixtures.commands import cairn, record_room, served, wait_for_fold
 from tests.fixtures.pages import DOCS, commands_of, programs_of
 from tests.fixtures.server.live import free_port
 
+from cairn_fusion.recording.recording import open_recording
+from cairn_fusion.recording.recording_writer import RecordingWriter
 from cairn_map.files.cell_folder import read_cells, read_head
 
 pytestmark = pytest.mark.processes
@@ -221,9 +225,19 @@ def test_the_example_robot_shares_what_it_sees(server: str, room_recording: Path
     assert " 0 commits wait" in done.stdout
 
 
+def write_labels(recording: Path, folder: Path) -> None:
+    """Write the first scans of a recording again, with label images in which all is wall."""
+    scans = open_recording(recording)
+    with RecordingWriter(folder, scans.rig, name=folder.name) as writer:
+        for scan in islice(scans, 2):
+            labels = np.ones(scan.range_m.shape, np.uint8)
+            writer.add(replace(scan, labels={scan.range_camera: labels}, label_names={1: "wall"}))
+
+
 def test_commands_of_the_operators_page_work_in_their_order(server: str, room_recording: Path, tmp_path: Path) -> None:
     maps = f"{server}/maps/operator-"
     replay = ("robot", "replay", room_recording, "--voxel", VOXEL_M, "--name", "mole")
+    write_labels(room_recording, tmp_path / "labelled")
     cairn(*replay, "--map", f"{maps}lab", folder=tmp_path)
     wait_for_fold(f"{maps}lab")
     for arguments in commands_of(DOCS / "operator.md"):
