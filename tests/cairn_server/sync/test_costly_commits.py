@@ -161,6 +161,7 @@ def test_a_commit_that_takes_much_memory_is_refused_and_large_workers_are_not_ke
         small, large, deep = server.new_map(), server.new_map(LARGE), server.new_map(DEEP)
         assert kind_of(server.push(deep, of_cells(1, geometry=DEEP, share=0.5))) == (400, "too_costly")
         assert server.push(small, pushed(0, 1)).status_code == 201
+        until(lambda: len(workers_of(server)) == 1, "the one that took too much is gone")
         (before,) = workers_of(server)
         # Any number of cells takes the memory of the largest one.
         assert server.push(large, of_cells(60)).status_code == 201

@@ -74,7 +74,9 @@ export class PlanPanel {
     const { floorsM } = this.heights.storeys;
     if (!this.isChosen) this.storey = storeyAt(floorsM, this.stage.view.target[2]);
     const madeOf = JSON.stringify([this.cells.head, this.cells.drawn, floorsM, this.storey]);
-    if (madeOf !== this.madeOf && performance.now() >= this.nextMs && this.cells.firstPictureMs !== null) {
+    // A raster of all that is there takes the time of a frame or more: while a large map comes, none is made.
+    const isComing = this.cells.isFetching || this.cells.waiting > 0 || this.cells.needsPlan;
+    if (madeOf !== this.madeOf && performance.now() >= this.nextMs && !(isComing && !this.isOpen) && this.cells.firstPictureMs !== null) {
       this.madeOf = madeOf;
       this.nextMs = performance.now() + AGAIN_MS;
       this.plan = floorPlanOf(this.cells, floorsM, this.storey);
