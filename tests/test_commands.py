@@ -305,7 +305,7 @@ def test_the_demos_map_is_in_the_browser_what_the_server_has(demo: tuple[Path, s
     room = Room(demo[0], free_port(LOOPBACK), name="building")
     room.start()
     try:
-        with browser() as chromium, chromium.new_context(viewport=VIEW) as context:  # type: ignore[arg-type]
+        with browser() as chromium, chromium.new_context(viewport=VIEW) as context:
             console = tab(context, room)
             console.open()
             console.log_in()

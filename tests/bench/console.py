@@ -158,7 +158,7 @@ def _robot(url: str, name: str) -> MapApi:
 @contextmanager
 def _page(chromium: Browser, url: str, name: str) -> Iterator[Console]:
     """A tab of a browser that has nothing from before."""
-    with chromium.new_context(viewport=VIEW) as context:  # type: ignore[arg-type]
+    with chromium.new_context(viewport=VIEW) as context:
         context.add_init_script(WATCH)
         console = Console(context.new_page(), None)
         console.page.goto(f"{url}/?test=1#map={name}")

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from axe_playwright_python.sync_playwright import Axe
-from playwright.sync_api import Browser, BrowserContext, Page, sync_playwright
+from playwright.sync_api import Browser, BrowserContext, Page, ViewportSize, sync_playwright
 from tests.console.room import ADMIN_TOKEN, Room
 
 from cairn_server.http.routes.console import STATIC
@@ -28,10 +28,10 @@ SMALL_PLAN = "c && (c.plan.small.style.visibility = a[0])"
 DEADLINE_S = 60.0
 LOADED_MACHINE = 10
 """Factor on the console's time limits: a machine that runs other tests at the same time is so much slower."""
-VIEW = {"width": 1280, "height": 720}
-SMALL_VIEW = {"width": 480, "height": 360}
-TABLET = {"width": 1024, "height": 768}
-UPRIGHT = {"width": 768, "height": 1024}
+VIEW: ViewportSize = {"width": 1280, "height": 720}
+SMALL_VIEW: ViewportSize = {"width": 480, "height": 360}
+TABLET: ViewportSize = {"width": 1024, "height": 768}
+UPRIGHT: ViewportSize = {"width": 768, "height": 1024}
 OVERFLOWING = """() => [...document.querySelectorAll("header, aside, footer, main, button, .legend")]
     .filter((e) => e.offsetParent && (e.getBoundingClientRect().right > innerWidth + 1
         || (e.matches("aside, button, .legend") && e.scrollWidth > e.clientWidth + 1)))
@@ -120,6 +120,18 @@ def tab(context: BrowserContext, room: Room) -> Console:
     made = Console(context.new_page(), room)
     made.page.add_init_script("localStorage.setItem('cairn.tools', localStorage.getItem('cairn.tools') ?? 'all')")
     return made
+
+
+@contextmanager
+def map_tab(chromium: Browser, room: Room, address: str, token: str = ADMIN_TOKEN) -> Iterator[Console]:
+    """A tab in which a map is drawn; `address` is what its link has after the `?`, from the # on."""
+    with chromium.new_context(viewport=VIEW, color_scheme="dark") as context:
+        found = tab(context, room)
+        found.open(address)
+        found.log_in(token)
+        found.settled()
+        found.errors.clear()  # the browser tells that a stranger was refused
+        yield found
 
 
 def skip_without_page() -> None:

@@ -21,7 +21,7 @@ def chromium(room: Room) -> Iterator[Browser]:
 @pytest.fixture(scope="module")
 def console(chromium: Browser, room: Room) -> Iterator[Console]:
     """A tab that shows the room, the same for all tests of a file."""
-    with chromium.new_context(viewport=VIEW, color_scheme="dark") as context:  # type: ignore[arg-type]
+    with chromium.new_context(viewport=VIEW, color_scheme="dark") as context:
         found = tab(context, room)
         found.open()
         found.log_in()

@@ -25,18 +25,18 @@ SCANS = 40
 COLD_K, HOT_K = 293.0, 350.0
 FLOOR = list(product(range(16), range(16), (0,)))
 CRATE = list(product(range(2, 6), range(2, 6), range(1, 5)))
-"""Comes."""
+"""Voxels that come."""
 DOOR = list(product((12,), range(4, 9), range(1, 9)))
-"""Goes."""
+"""Voxels that go."""
 PLATE = list(product(range(9, 14), range(10, 14), (0,)))
-"""Of the floor; gets warm."""
+"""Part of the floor that gets warm."""
 GHOST = list(product(range(1, 5), range(9, 13), range(6, 9)))
 """Never was there: the commit is taken out."""
 
 
 @dataclass(frozen=True)
 class Sight:
-    """What one commit saw."""
+    """Evidence of one commit."""
 
     author: Author
     n: int
@@ -92,7 +92,7 @@ SIGHTS = [
     Sight(WREN, 3, 9 * 3600 + 300, at(FLOOR[64:128])),
 ]
 OUT = SIGHTS[4]
-"""Is taken out."""
+"""Commit that is taken out."""
 CHANGED = {"appeared": CRATE, "gone": DOOR, "warmer": PLATE}
 BEFORE_S = START_S + 700
-"""Of all these changes; since then."""
+"""Time before all these changes."""

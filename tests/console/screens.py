@@ -58,10 +58,10 @@ def take_screens(console: Console, folder: Path, theme: str) -> list[Path]:
     page.locator("[data-robot]:not(:disabled)").first.click()
     page.get_by_alt_text("would see it").wait_for()
     for view in SIZES:
-        page.set_viewport_size(view)  # type: ignore[arg-type]
+        page.set_viewport_size(view)
         page.wait_for_timeout(300)
         shoot("followed", view["width"])
-    page.set_viewport_size(VIEW)  # type: ignore[arg-type]
+    page.set_viewport_size(VIEW)
     page.locator(".host canvas").focus()
     page.keyboard.press("Escape")
     page.get_by_role("region", name="Take away").scroll_into_view_if_needed()
@@ -95,7 +95,7 @@ def main() -> int:
     head, _, look = args.url.partition("#")
     with browser() as made:
         for theme in ("dark", "light"):
-            with made.new_context(viewport=VIEW, color_scheme=theme) as context:  # type: ignore[arg-type]
+            with made.new_context(viewport=VIEW, color_scheme=theme) as context:
                 console = Console(context.new_page(), None)
                 console.page.goto(f"{head.rstrip('/')}/?test=1#{look}")
                 console.settled()

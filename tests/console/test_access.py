@@ -23,7 +23,7 @@ FOCUSED = """() => {
 
 @pytest.fixture(params=["dark", "light"])
 def console(request: pytest.FixtureRequest, chromium: Browser, room: Room) -> Iterator[Console]:
-    with chromium.new_context(viewport=VIEW, color_scheme=request.param) as context:  # type: ignore[arg-type]
+    with chromium.new_context(viewport=VIEW, color_scheme=request.param) as context:
         found = tab(context, room)
         found.open()
         yield found
@@ -50,10 +50,10 @@ def test_axe_finds_nothing_serious_in_any_mode_or_panel(console: Console, room: 
     page.get_by_title("Follow scout").click()
     page.get_by_alt_text("The map as scout would see it").wait_for()
     for view in (VIEW, TABLET, UPRIGHT):
-        page.set_viewport_size(view)  # type: ignore[arg-type]
+        page.set_viewport_size(view)
         found += serious(console, f"all panels in use, {view['width']} px")
         assert page.evaluate(OVERFLOWING) == [], view
-    page.set_viewport_size(VIEW)  # type: ignore[arg-type]
+    page.set_viewport_size(VIEW)
     for name, opener in (("Keys", "?"), ("Share", "Share")):
         page.get_by_role("button", name=opener, exact=True).click()
         page.get_by_role("dialog", name=name).wait_for()

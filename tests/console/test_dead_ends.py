@@ -26,7 +26,7 @@ def bare(chromium: Browser, tmp_path: Path) -> Iterator[Console]:
     made = Room(tmp_path, free_port(LOOPBACK))
     made.start()
     try:
-        with chromium.new_context(viewport=VIEW, color_scheme="dark") as context:  # type: ignore[arg-type]
+        with chromium.new_context(viewport=VIEW, color_scheme="dark") as context:
             found = tab(context, made)
             found.open("")
             found.log_in()
@@ -61,7 +61,7 @@ def test_a_server_without_a_map_names_commands_that_make_one_and_fill_it(
 
 
 def test_a_link_to_an_unknown_map_never_shows_another_one(chromium: Browser, room: Room) -> None:
-    with chromium.new_context(viewport=VIEW, color_scheme="light") as context:  # type: ignore[arg-type]
+    with chromium.new_context(viewport=VIEW, color_scheme="light") as context:
         console = tab(context, room)
         console.open("#map=garage&eye=1,2,3&target=0,0,0")
         console.log_in()
@@ -77,7 +77,7 @@ def test_a_link_to_an_unknown_map_never_shows_another_one(chromium: Browser, roo
 
 
 def test_a_revoked_token_is_said_and_the_view_stays(chromium: Browser, room: Room) -> None:
-    with room.api as api, chromium.new_context(viewport=VIEW) as context:  # type: ignore[arg-type]
+    with room.api as api, chromium.new_context(viewport=VIEW) as context:
         secret = api.create_token(GUEST, CreateToken(role="reader")).token
         console = tab(context, room)
         console.open(f"#map={MAP}&by=height&eye=1,2,5&target=0,0,1")
@@ -94,7 +94,7 @@ def test_a_revoked_token_is_said_and_the_view_stays(chromium: Browser, room: Roo
 
 def test_without_webgl_the_server_draws_the_map(chromium: Browser, room: Room) -> None:
     blind = chromium.browser_type.launch(executable_path=CHROMIUM, args=[FLAGS[0], "--disable-3d-apis"])
-    with blind.new_context(viewport=VIEW) as context:  # type: ignore[arg-type]
+    with blind.new_context(viewport=VIEW) as context:
         console = tab(context, room)
         console.open()
         console.log_in()

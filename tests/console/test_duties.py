@@ -66,7 +66,7 @@ def gate(room: Room) -> Iterator[Gate]:
 
 @pytest.fixture(scope="module")
 def context(chromium: Browser) -> Iterator[BrowserContext]:
-    with chromium.new_context(viewport=VIEW, color_scheme="dark") as made:  # type: ignore[arg-type]
+    with chromium.new_context(viewport=VIEW, color_scheme="dark") as made:
         yield made
 
 
@@ -108,9 +108,9 @@ def test_an_operator_compares_the_key_of_a_robot_that_asks_and_lets_it_in(gate: 
     row.get_by_text("mole asks to be let in").wait_for()
     row.get_by_text(digits(OLD_MOLE)[:9]).wait_for()
     found = serious(desk, "a robot asks")
-    page.set_viewport_size(UPRIGHT)  # type: ignore[arg-type]
+    page.set_viewport_size(UPRIGHT)
     assert page.evaluate(OVERFLOWING) == []
-    page.set_viewport_size(VIEW)  # type: ignore[arg-type]
+    page.set_viewport_size(VIEW)
     row.get_by_role("button", name="Compare").click()
     dialog = page.get_by_role("dialog", name="Is this mole?")
     for author in (MOLE, OLD_MOLE):

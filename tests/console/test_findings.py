@@ -10,7 +10,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 from playwright.sync_api import Browser, Locator
-from tests.console.browsing import VIEW, Console, serious, tab
+from tests.console.browsing import Console, map_tab, serious
 from tests.console.hot_room import GEOMETRY, HIGH, SPOTS, WIDE, centre_m, commit_of
 from tests.console.hot_room import room as hot_room
 from tests.console.room import ADMIN_TOKEN, Room
@@ -51,13 +51,8 @@ def tokens(room: Room) -> dict[str, str]:
 @contextmanager
 def seen_by(role: str, tokens: dict[str, str], chromium: Browser, room: Room) -> Iterator[Console]:
     """A screen of its own."""
-    with chromium.new_context(viewport=VIEW, color_scheme="dark") as context:  # type: ignore[arg-type]
-        console = tab(context, room)
-        console.open(f"#map={FURNACE}")
-        console.log_in(tokens[role])
-        console.settled()
+    with map_tab(chromium, room, f"#map={FURNACE}", tokens[role]) as console:
         console.until(f"c.findings.spots.spots.length === {len(SPOTS)}", "hot spots are listed")
-        console.errors.clear()  # the browser tells of the 401 before
         yield console
 
 

@@ -29,7 +29,7 @@ BUDGET, TINY = 8000, 1000
 
 @pytest.fixture(scope="module")
 def console(chromium: Browser, room: Room) -> Iterator[Console]:
-    with room.api as api, chromium.new_context(viewport=VIEW) as context:  # type: ignore[arg-type]
+    with room.api as api, chromium.new_context(viewport=VIEW) as context:
         make_campus(api, MAP, CAMPUS, cells=CELLS)
         found = tab(context, room)
         try:

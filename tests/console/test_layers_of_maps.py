@@ -25,7 +25,7 @@ def test_a_layer_is_chosen_by_its_name_and_has_the_marks_of_its_map(room: Room, 
         api.push(LAYER, commit)
         until(lambda: any(entry.id == str(commit.id) for entry in api.log(LAYER)), "the layer's commit is folded")
         api.put_mark(SITE, MarkRequest(mark=MarkText(kind="door", name="north door", place_m=(1.0, 1.0, 1.0))))
-    with chromium.new_context(viewport=VIEW, color_scheme="dark") as context:  # type: ignore[arg-type]
+    with chromium.new_context(viewport=VIEW, color_scheme="dark") as context:
         console = tab(context, room)
         console.open(f"#map={LAYER}")
         console.log_in()

@@ -1,13 +1,14 @@
 """Sizes of screens, from a wide one to a phone on its side: the map has most of each; fingers hit what they aim at."""
 
 import pytest
-from playwright.sync_api import Browser
+from playwright.sync_api import Browser, ViewportSize
 from tests.console.browsing import OVERFLOWING, TABLET, VIEW, Console, findings_of_axe
 from tests.console.room import Room
 
 pytestmark = pytest.mark.browser
 
-PHONE, PHONE_ASIDE = {"width": 390, "height": 844}, {"width": 844, "height": 390}
+PHONE: ViewportSize = {"width": 390, "height": 844}
+PHONE_ASIDE: ViewportSize = {"width": 844, "height": 390}
 LEAST_SHARES = ((VIEW, 0.70), (TABLET, 0.60), (PHONE, 0.85), (PHONE_ASIDE, 0.85))
 SHARE = """() => {
   let [inside, all] = [0, 0];
@@ -29,7 +30,7 @@ TABS = ("Findings", "Robots", "Tools", "Time", "Map")
 @pytest.fixture(scope="module")
 def fresh(chromium: Browser, room: Room) -> Console:
     """A profile that was never here, on a touch screen."""
-    context = chromium.new_context(viewport=VIEW, color_scheme="dark", has_touch=True)  # type: ignore[arg-type]
+    context = chromium.new_context(viewport=VIEW, color_scheme="dark", has_touch=True)
     found = Console(context.new_page(), room)
     found.open()
     found.log_in()
@@ -41,20 +42,18 @@ def fresh(chromium: Browser, room: Room) -> Console:
     ("size", "least"), LEAST_SHARES, ids=lambda each: str(each.get("width", "")) if isinstance(each, dict) else ""
 )
 def test_the_map_has_most_of_the_screen_and_nothing_is_cut_off(
-    fresh: Console, size: dict[str, int], least: float
+    fresh: Console, size: ViewportSize, least: float
 ) -> None:
-    fresh.page.set_viewport_size(size)  # type: ignore[arg-type]
+    fresh.page.set_viewport_size(size)
     fresh.settled()
     assert fresh.page.evaluate(SHARE) >= least
     assert fresh.page.evaluate(OVERFLOWING) == []
 
 
 @pytest.mark.parametrize("size", [PHONE, PHONE_ASIDE], ids=["upright", "aside"])
-def test_a_phones_sheet_shows_one_panel_at_a_time_with_targets_for_fingers(
-    fresh: Console, size: dict[str, int]
-) -> None:
+def test_a_phones_sheet_shows_one_panel_at_a_time_with_targets_for_fingers(fresh: Console, size: ViewportSize) -> None:
     page = fresh.page
-    page.set_viewport_size(size)  # type: ignore[arg-type]
+    page.set_viewport_size(size)
     panels = page.get_by_role("navigation", name="Panels")
     shown = {"Findings": "Findings", "Robots": "Robots", "Tools": "Look", "Time": "Commits"}
     for name in TABS:
@@ -78,7 +77,7 @@ def test_a_phones_sheet_shows_one_panel_at_a_time_with_targets_for_fingers(
 def test_a_tap_on_the_map_opens_its_reading_and_escape_puts_it_away(fresh: Console) -> None:
     page = fresh.page
     for size in (PHONE, VIEW):
-        page.set_viewport_size(size)  # type: ignore[arg-type]
+        page.set_viewport_size(size)
         fresh.ask_middle()
         card = page.get_by_role("region", name="Voxel")
         card.get_by_text("over the floor").wait_for()
@@ -89,7 +88,7 @@ def test_a_tap_on_the_map_opens_its_reading_and_escape_puts_it_away(fresh: Conso
 
 def test_a_tools_button_opens_its_card_and_shuts_it_and_a_column_stays(fresh: Console) -> None:
     page = fresh.page
-    page.set_viewport_size(VIEW)  # type: ignore[arg-type]
+    page.set_viewport_size(VIEW)
     shelf = page.get_by_role("navigation", name="Tools")
     assert page.evaluate(SMALL, 24) == []
     for name, region in (("Look", "Look"), ("Measure", "Measure"), ("Export", "Take away")):

@@ -96,7 +96,7 @@ def console(chromium: Browser, room: Room) -> Iterator[Console]:
                 until(lambda: len(log_of(api)) == 1 + RETRACTS, "the retracts are folded")
         until(lambda: len(log_of(api)) == LOG, "all commits are folded")
         assert len(api.log(LONG, limit=1000)) < 1 + RETRACTS, "a page ends early"
-    with chromium.new_context(viewport=VIEW) as context:  # type: ignore[arg-type]
+    with chromium.new_context(viewport=VIEW) as context:
         found = tab(context, room)
         found.open(f"#map={LONG}")
         found.log_in()

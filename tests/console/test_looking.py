@@ -137,7 +137,7 @@ def test_only_so_many_voxels_are_drawn_and_the_finest_are_where_the_eye_is(conso
 @pytest.fixture
 def stair(chromium: Browser, room: Room) -> Iterator[tuple[Console, MapApi]]:
     """A page that shows one cell, from the side, by height."""
-    with room.api as api, chromium.new_context(viewport=VIEW, color_scheme="dark") as context:  # type: ignore[arg-type]
+    with room.api as api, chromium.new_context(viewport=VIEW, color_scheme="dark") as context:
         api.create_map(STAIR, CreateMap(geometry=SMALL))
         push_cell(api, 0, FIRST)
         found = tab(context, room)
@@ -209,7 +209,7 @@ def test_a_legend_that_is_locked_keeps_its_ends_when_more_comes_into_sight(
 
 
 def test_a_map_is_shown_cell_by_cell_where_all_at_once_takes_long(chromium: Browser, room: Room) -> None:
-    with chromium.new_context(viewport=VIEW) as context:  # type: ignore[arg-type]
+    with chromium.new_context(viewport=VIEW) as context:
         console = tab(context, room)
         held: list[Route] = []
         console.page.route("**/main/views", lambda route: held.append(route))
@@ -223,12 +223,12 @@ def test_a_map_is_shown_cell_by_cell_where_all_at_once_takes_long(chromium: Brow
 
 
 def test_what_the_server_has_ready_is_shown_after_one_request(chromium: Browser, room: Room) -> None:
-    with chromium.new_context(viewport=VIEW) as context:  # type: ignore[arg-type]
+    with chromium.new_context(viewport=VIEW) as context:
         first = tab(context, room)
         first.open()
         first.log_in()
         first.settled()  # what was not ready is from now on
-    with chromium.new_context(viewport=VIEW) as context:  # type: ignore[arg-type]
+    with chromium.new_context(viewport=VIEW) as context:
         second = tab(context, room)
         asked: list[str] = []
         second.page.on("request", lambda request: asked.append(request.url))

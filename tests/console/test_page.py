@@ -47,7 +47,7 @@ UPDATE = """async ([times]) => {
 
 @pytest.fixture(scope="module")
 def console(chromium: Browser, room: Room) -> Iterator[Console]:
-    with chromium.new_context(viewport=VIEW, color_scheme="dark") as context:  # type: ignore[arg-type]
+    with chromium.new_context(viewport=VIEW, color_scheme="dark") as context:
         found = tab(context, room)
         yield found
 

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from playwright.sync_api import Browser
-from tests.console.browsing import SMALL_VIEW, VIEW, Console, tab
+from tests.console.browsing import SMALL_VIEW, VIEW, Console, map_tab, tab
 from tests.console.campus import make_copies
 from tests.console.casting import Occupied, occupied
 from tests.console.room import GEOMETRY, MAP, Room
@@ -44,12 +44,7 @@ LINE = (0xFF, 0x3D, 0x7F)
 
 @pytest.fixture(scope="module")
 def console(chromium: Browser, room: Room) -> Iterator[Console]:
-    with chromium.new_context(viewport=VIEW, color_scheme="dark") as context:  # type: ignore[arg-type]
-        found = tab(context, room)
-        found.open(f"#map={MAP}")
-        found.log_in()
-        found.settled()
-        found.errors.clear()  # the browser tells that a stranger was refused
+    with map_tab(chromium, room, f"#map={MAP}") as found:
         yield found
 
 
@@ -132,7 +127,7 @@ def test_the_colour_bar_is_the_same_from_wherever_one_looks(
     assert hottest, said
     assert float(hottest[1]) == pytest.approx(float(np.nanmax(voxels.temperature_k)) - KELVIN, abs=0.051)
     assert float(ends[1]) < float(hottest[1])
-    with chromium.new_context(viewport=SMALL_VIEW, color_scheme="light") as context:  # type: ignore[arg-type]
+    with chromium.new_context(viewport=SMALL_VIEW, color_scheme="light") as context:
         other = tab(context, room)
         other.open(f"#map={MAP}&by=temperature&ceiling=0.5&eye=0.5,0.5,1.5&target=3,3,1")
         other.log_in()
@@ -248,7 +243,7 @@ def test_lines_are_drawn_over_the_shading(console: Console) -> None:
 def test_a_storey_is_shown_alone(chromium: Browser, room: Room, voxels: Occupied) -> None:
     rise_m = STOREY_CELLS * EDGE_M * 2**GEOMETRY.depth
     floor = floor_m(voxels)
-    with room.api as api, chromium.new_context(viewport=VIEW) as context:  # type: ignore[arg-type]
+    with room.api as api, chromium.new_context(viewport=VIEW) as context:
         make_copies(api, MAP, TOWER, steps=[(0, 0, 0), (0, 0, STOREY_CELLS)])
         tower = tab(context, room)
         tower.open(f"#map={TOWER}")

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import pytest
 from playwright.sync_api import Browser
-from tests.console.browsing import VIEW, Console, findings_of_axe, tab
+from tests.console.browsing import Console, findings_of_axe, map_tab
 from tests.console.hot_room import COLD_K, GEOMETRY, commit_of
 from tests.console.room import Room
 from tests.fixtures.server.deadline import until
@@ -18,7 +18,7 @@ HALL = "hall"
 WIDE, HIGH = 32, 25
 """A hall without a roof, 2.56 m by 2.56 m inside and 2 m high: 8 cm a voxel."""
 HOLE = set(itertools.product(range(10, 15), range(20, 24)))
-"""Where no floor was seen."""
+"""Part of the floor that no robot saw."""
 TABLE = set(itertools.product(range(20, 26), range(4, 9)))
 KINDS = "[...c.plan.plan.kinds].reduce((sum, kind) => (sum[kind]++, sum), [0, 0, 0, 0, 0, 0])"
 GAP, FLOOR, THING, WALL = 1, 2, 3, 4
@@ -39,13 +39,8 @@ def console(chromium: Browser, room: Room) -> Iterator[Console]:
         commit = commit_of(hall(), 0)
         api.push(HALL, commit)
         until(lambda: any(entry.id == str(commit.id) for entry in api.log(HALL)), "the hall is folded")
-    with chromium.new_context(viewport=VIEW, color_scheme="dark") as context:  # type: ignore[arg-type]
-        found = tab(context, room)
-        found.open(f"#map={HALL}")
-        found.log_in()
-        found.settled()
+    with map_tab(chromium, room, f"#map={HALL}") as found:
         found.until("c.heights.storeys.floorsM.length === 1 && c.plan.plan?.gapsM2 > 0", "the storey has a plan")
-        found.errors.clear()
         yield found
 
 
@@ -80,7 +75,7 @@ def test_the_plan_says_in_words_what_it_shows_and_a_click_flies_there(console: C
 
 
 def test_a_cell_without_room_in_the_picture_is_no_gap(console: Console) -> None:
-    """What the page leaves out for want of room was seen by robots."""
+    """Robots saw cells that the page leaves out for want of room."""
     before = console.tell("c.cells.budget")
     try:
         console.tell("(c.cells.budget = 1, c.moved = true)")

@@ -70,7 +70,7 @@ def keys(room: Room) -> dict[str, str]:
 
 @pytest.fixture(scope="module")
 def desk(chromium: Browser, room: Room, keys: dict[str, str]) -> Iterator[Console]:
-    with chromium.new_context(viewport=VIEW, color_scheme="dark") as context:  # type: ignore[arg-type]
+    with chromium.new_context(viewport=VIEW, color_scheme="dark") as context:
         found = tab(context, room)
         other = hashlib.sha256(png() + b".").hexdigest()
         found.page.route(f"**/attachments/{other}", lambda route: route.fulfill(body=png(), content_type="image/png"))

@@ -15,7 +15,7 @@ pytestmark = pytest.mark.browser
 
 @pytest.mark.parametrize("theme", ["dark", "light"])
 def test_every_mode_has_its_picture(chromium: Browser, room: Room, tmp_path: Path, theme: str) -> None:
-    with chromium.new_context(viewport=VIEW, color_scheme=theme) as context:  # type: ignore[arg-type]
+    with chromium.new_context(viewport=VIEW, color_scheme=theme) as context:
         console = tab(context, room)
         console.open()
         console.page.get_by_label("Token").wait_for()

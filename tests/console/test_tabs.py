@@ -24,7 +24,7 @@ DRAWN_S = 3
 
 
 def test_eight_tabs_hear_of_a_commit_and_draw_it(chromium: Browser, room: Room) -> None:
-    with chromium.new_context(viewport=SMALL_VIEW) as context:  # type: ignore[arg-type]
+    with chromium.new_context(viewport=SMALL_VIEW) as context:
         tabs = [tab(context, room) for _ in range(TABS)]
         for number, each in enumerate(tabs):
             each.open()
@@ -65,7 +65,7 @@ def lan_room(room: Room, tmp_path: Path) -> Iterator[Room]:
 
 
 def test_over_plain_http_on_a_lan_the_page_is_whole_and_tells_what_is_gone(chromium: Browser, lan_room: Room) -> None:
-    with chromium.new_context(viewport=SMALL_VIEW) as context:  # type: ignore[arg-type]
+    with chromium.new_context(viewport=SMALL_VIEW) as context:
         console = tab(context, lan_room)
         console.open()
         console.log_in()

@@ -34,7 +34,7 @@ KEPT = """URL.createObjectURL = ((make) => (blob) => {
 def test_every_kind_of_file_is_saved_and_the_lines_bring_the_same(
     chromium: Browser, room: Room, tmp_path: Path
 ) -> None:
-    with chromium.new_context(viewport=VIEW) as context:  # type: ignore[arg-type]
+    with chromium.new_context(viewport=VIEW) as context:
         console = tab(context, room)
         console.open()
         console.log_in()
@@ -65,7 +65,7 @@ def test_every_kind_of_file_is_saved_and_the_lines_bring_the_same(
 
 
 def test_the_browser_saves_what_the_page_never_held(chromium: Browser, room: Room) -> None:
-    with chromium.new_context(viewport=VIEW) as context:  # type: ignore[arg-type]
+    with chromium.new_context(viewport=VIEW) as context:
         console = tab(context, room)
         console.page.add_init_script(KEPT)
         console.open()
@@ -84,7 +84,7 @@ def test_the_browser_saves_what_the_page_never_held(chromium: Browser, room: Roo
 
 
 def test_why_nothing_is_saved_stands_on_the_page(chromium: Browser, room: Room) -> None:
-    with chromium.new_context(viewport=VIEW) as context:  # type: ignore[arg-type]
+    with chromium.new_context(viewport=VIEW) as context:
         console = tab(context, room)
         console.open()
         console.log_in()

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from playwright.sync_api import Browser, FloatRect, Locator, Route
-from tests.console.browsing import VIEW, Console, tab
+from tests.console.browsing import Console, map_tab
 from tests.console.room import ADMIN_TOKEN, Room
 from tests.fixtures.map.made import SMALL, surface_evidence
 from tests.fixtures.server.live import until
@@ -86,13 +86,8 @@ def look(api: MapApi, q_map_rig: tuple[float, float, float, float]) -> None:
 
 @pytest.fixture(scope="module")
 def console(chromium: Browser, room: Room, crew: MapApi) -> Iterator[Console]:
-    with chromium.new_context(viewport=VIEW, color_scheme="dark") as context:  # type: ignore[arg-type]
-        found = tab(context, room)
-        found.open(f"#map={CREW}{FROM_ABOVE}")
-        found.log_in()
-        found.settled()
+    with map_tab(chromium, room, f"#map={CREW}{FROM_ABOVE}") as found:
         found.until("c.team.branches.length === 3", "the page knows the team")
-        found.errors.clear()
         yield found
 
 

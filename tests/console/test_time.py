@@ -10,12 +10,13 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from playwright.sync_api import Browser
-from tests.console.browsing import VIEW, Console, serious, tab
+from tests.console.browsing import Console, map_tab, serious
 from tests.console.past_map import BEFORE_S, CHANGED, EPOCH_S, GEOMETRY, OUT, SIGHTS, Sight, at
 from tests.console.room import Room
 from tests.fixtures.server.live import until
 from tests.fixtures.server.pushes import MOLE
 
+from cairn_client.http.api import MapApi
 from cairn_map.codec.view_code import decode_view
 from cairn_map.kernels.morton_kernels import deinterleave
 from cairn_map.wire.messages import CreateMap, Retract
@@ -39,21 +40,21 @@ def past(room: Room) -> Room:
         api.create_map(PAST, CreateMap(geometry=GEOMETRY, epoch_s=EPOCH_S))
         for sight in SIGHTS:
             api.push(PAST, sight.commit)
-        until(lambda: len(api.log(PAST)) == len(SIGHTS), "all commits are folded")
+        wait_for_entries(api, PAST, len(SIGHTS))
         api.retract(PAST, Retract(commits=[str(OUT.commit.id)], note=NOTE))
-        until(lambda: len(api.log(PAST)) == len(SIGHTS) + 2, "one is taken out")
+        wait_for_entries(api, PAST, len(SIGHTS) + 2)  # a retract, and what it took out
     return room
 
 
 @pytest.fixture(scope="module")
 def console(chromium: Browser, past: Room) -> Iterator[Console]:
-    with chromium.new_context(viewport=VIEW, color_scheme="dark") as context:  # type: ignore[arg-type]
-        found = tab(context, past)
-        found.open(f"#map={PAST}&ceiling=off")
-        found.log_in()
-        found.settled()
-        found.errors.clear()  # the browser tells that a stranger was refused
+    with map_tab(chromium, past, f"#map={PAST}&ceiling=off") as found:
         yield found
+
+
+def wait_for_entries(api: MapApi, name: str, count: int) -> None:
+    """Wait until a map's log has so many entries."""
+    until(lambda: len(api.log(name)) == count, f"{name} has {count} entries")
 
 
 def nodes_shown(console: Console) -> Nodes:
@@ -92,18 +93,15 @@ def test_random_logs_have_an_axis_on_which_every_commit_is_reached() -> None:
 def test_every_moment_is_the_map_of_what_was_measured_until_then_and_is_not_out(console: Console, past: Room) -> None:
     now = nodes_shown(console)
     moments = console.tell("c.time.timeline.moments.map(({ atS }) => atS)")
-    assert moments == [sight.time_s for sight in SIGHTS if sight is not OUT]
+    kept = [sight for sight in SIGHTS if sight is not OUT]
+    assert moments == [sight.time_s for sight in kept]
     with past.api as api:
         api.create_map(THEN, CreateMap(geometry=GEOMETRY, epoch_s=EPOCH_S))
-    pushed = 0
-    for moment in moments[:-1]:
+    for n, sight in enumerate(kept[:-1], 1):
         with past.api as api:
-            for sight in SIGHTS:
-                if moment - EPOCH_S < sight.time_s <= moment and sight is not OUT:
-                    api.push(THEN, sight.commit)
-                    pushed += 1
-            until(lambda: len(api.log(THEN)) == pushed, "what was measured until then")  # noqa: B023
-        console.tell("c.time.show(a[0])", moment)
+            api.push(THEN, sight.commit)
+            wait_for_entries(api, THEN, n)
+        console.tell("c.time.show(a[0])", sight.time_s)
         console.settled()
         shown, then = nodes_shown(console), nodes_of(past, THEN, GEOMETRY.depth)
         assert shown.keys() == then.keys()

@@ -396,7 +396,7 @@ def test_a_cloud_next_to_cameras_is_a_scan_without_their_images(tmp_path: Path) 
         return in_bag_order(sorted(timed, key=lambda entry: entry[0]))
 
     lidar = {"spectrum": "range", "topic": "/points", "lidar": {"kind": "cloud"}, "frame": "depth_frame"}
-    text = mapping_text(cameras={**MAPPING["cameras"], "lidar": lidar})  # type: ignore[dict-item]
+    text = mapping_text(cameras={**MAPPING["cameras"], "lidar": lidar})
     scans = list(open_source(write_bag(tmp_path / "drive", "mcap", messages), mapping=mapping_from_yaml(text, "it")))
     loose = [scan for scan in scans if scan.range_camera == "lidar"]
     assert len(loose) == 4 and len(scans) > 7

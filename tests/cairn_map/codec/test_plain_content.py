@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.fixtures.map.made import GEOMETRIES, KEY, any_evidence, random_evidence, surface_evidence
 
+from cairn_map.arrays import Ints
 from cairn_map.codec import cell_code, cell_reading
 from cairn_map.codec.cell_code import EncodedCell, cell_digest, decode_canonical_cell, decode_cell, encode_cell
 from cairn_map.codec.cell_reading import CellReader, cell_reader
@@ -123,7 +124,7 @@ def test_numbers_of_every_size_are_the_same_written_at_once(evidence: Evidence) 
     assert encode_cell(KEY, strided, GEOMETRIES[0]) == slow
 
 
-def arrays_in(evidence: Evidence) -> list[np.ndarray]:  # type: ignore[type-arg]
+def arrays_in(evidence: Evidence) -> list[Ints]:
     return [evidence.voxels, evidence.counts, evidence.sampled, evidence.samples]
 
 

@@ -119,7 +119,7 @@ def test_a_push_whose_last_byte_comes_while_the_server_stops_is_answered(tmp_pat
 
 
 def is_listening(process: Process) -> bool:
-    """Whether the server still takes connections."""
+    """True while the server takes connections."""
     assert process.url
     try:
         socket.create_connection(("127.0.0.1", urlsplit(process.url).port or 0), timeout=DEADLINE_S).close()
