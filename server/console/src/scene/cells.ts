@@ -45,6 +45,8 @@ export class Cells {
   private ready = NONE_READY;
   /** Moment that is shown, or on its way; null: now. */
   private moment: Moment | null = null;
+  /** Turns to other moments so far: an answer that was asked for before the last of them is of another moment. */
+  private turns = 0;
   private readonly past = new PastViews();
   /** Why some cells are not known at the moment that is shown: the server's words. */
   unknown: string | null = null;
@@ -98,8 +100,14 @@ export class Cells {
   /** Show the map as it was at a moment; null: as it is. What was shown before is kept, so the way back is short. */
   showMoment(moment: Moment | null): void {
     if (moment?.key === this.moment?.key) return;
-    if (!this.moment) for (const cell of this.all.values()) if (!cell.dirty && cell.etag !== null) this.past.put(...this.nameOf(cell, cell.depth), cell.bytes);
+    if (!this.moment) {
+      for (const cell of this.all.values()) {
+        // Of a busy cell that changed the old bytes are still shown: under the name of its new state they would come back as now.
+        if (!cell.dirty && !cell.busy && cell.etag !== null) this.past.put(...this.nameOf(cell, cell.depth), cell.bytes);
+      }
+    }
     this.moment = moment;
+    this.turns++;
     this.unknown = null;
     for (const cell of this.all.values()) {
       const depth = cell.depth || cell.wanted;
@@ -215,7 +223,7 @@ export class Cells {
     cell.dirty = false;
     // The first picture is coarse, whatever will be wanted.
     const depth = cell.etag === null ? Math.min(cell.wanted, Math.max(this.depthMax - COARSE, 1)) : cell.wanted;
-    const { moment } = this;
+    const { moment, turns } = this;
     const name = this.nameOf(cell, depth);
     try {
       const changes = depth === cell.depth && cell.momentKey === this.momentKey;
@@ -224,14 +232,14 @@ export class Cells {
       if (data) {
         const decoded = await this.decoders.decode(data);
         const bytes = moment ? this.past.put(...name, decoded) : decoded;
-        if (moment !== this.moment) {
-          cell.dirty = true; // another moment is shown by now
-          return;
-        }
-        if (this.all.get(cell.key) === cell) {
+        if (turns === this.turns && this.all.get(cell.key) === cell) {
           if (changes && cell.etag) cell.freshMs = performance.now() + FRESH_MS;
           this.show(cell, bytes, depth);
         }
+      }
+      if (turns !== this.turns) {
+        cell.dirty = true; // another moment is shown by now, so also "not modified" says nothing of what is shown
+        return;
       }
       cell.momentKey = moment?.key ?? "";
       cell.isUnknown = false;
@@ -244,7 +252,7 @@ export class Cells {
         isWhole = true;
       }
     } catch (error) {
-      if (moment === this.moment) this.failed(cell, error);
+      if (turns === this.turns) this.failed(cell, error);
       else cell.dirty = true;
     } finally {
       this.running--;
