@@ -13,6 +13,7 @@ import { ChangesPanel, COLOURS } from "./ui/time/changes_panel.ts";
 
 /** Handles rest so long before the server is asked: it looks through every cell that has news. */
 const REST_MS = 300;
+/** From one question to the next while robots map, or the server is busy. */
 const AGAIN_MS = 3000;
 
 export class Comparison {
@@ -22,8 +23,16 @@ export class Comparison {
   onFly: (to: ReturnType<typeof visibleFrom>) => void = () => {};
   private changes: Changes | null = null;
   private readonly hidden = new Set<Way>(["moved"]);
-  /** What was asked, or is to be; empty: nothing is compared. */
-  private asked = "";
+  /** Moments that are compared; empty: nothing is. */
+  private handles = "";
+  /** Largest `lm` that was heard of when the server was asked last. */
+  private head = -1;
+  /** Number of the last question: the answer to another one is old. */
+  private turn = 0;
+  /** A question is to be asked, or its answer is on its way. */
+  private isPending = false;
+  /** The list is of other moments, or there is none. */
+  private isOld = true;
   private timer = 0;
   private drawn = "";
   private readonly api: Api;
@@ -50,43 +59,69 @@ export class Comparison {
   /** A few times a second: compare what the look says, and again when the map changed. */
   tick(): void {
     const { sinceS, atS } = this.look;
-    const asked = sinceS === null ? "" : JSON.stringify([sinceS, atS, this.cells.head]);
-    if (asked !== this.asked) {
-      this.asked = asked;
-      window.clearTimeout(this.timer);
-      if (asked) {
+    const handles = sinceS === null ? "" : JSON.stringify([sinceS, atS]);
+    if (handles !== this.handles) {
+      this.handles = handles;
+      this.isOld = true;
+      if (handles) {
         this.panel.say("Comparing …");
-        this.timer = window.setTimeout(() => void this.ask(asked), REST_MS);
+        this.askIn(REST_MS);
       } else {
+        this.stop();
         this.changes = null;
         this.things = [];
         this.panel.close();
       }
+    } else if (handles && this.head !== this.cells.head && !this.isPending) {
+      // The list stays. A head that moves at each tick puts nothing off.
+      this.askIn(AGAIN_MS);
     }
     this.draw();
   }
 
   dispose(): void {
-    window.clearTimeout(this.timer);
-    this.asked = "";
+    this.stop();
     this.voxels.dispose();
   }
 
-  private async ask(asked: string): Promise<void> {
+  private stop(): void {
+    window.clearTimeout(this.timer);
+    this.turn++;
+    this.isPending = false;
+  }
+
+  private askIn(waitMs: number): void {
+    this.stop();
+    this.isPending = true;
+    const { turn } = this;
+    this.timer = window.setTimeout(() => void this.ask(turn), waitMs);
+  }
+
+  private async ask(turn: number): Promise<void> {
     const { sinceS, atS } = this.look;
+    // Until the next tick asks for them the handles may be elsewhere.
+    if (JSON.stringify([sinceS, atS]) !== this.handles) return this.askIn(REST_MS);
+    this.head = this.cells.head;
     const until = atS === null ? "" : `&until=${atS}`;
     try {
       const changes = await this.api.json<Changes>(`maps/${this.info.name}/main/changes?since=${sinceS}${until}`);
-      if (asked !== this.asked) return;
+      if (turn !== this.turn) return;
+      if (this.isOld) this.drawn = ""; // the list takes the place of words also where it is the same
+      this.isPending = this.isOld = false;
       this.changes = changes;
       this.things = thingsOf(changes, this.info.geometry.voxel_edge_um / 1e6);
       this.draw();
     } catch (error) {
-      if (asked !== this.asked) return;
-      this.changes = null;
-      this.things = [];
-      this.panel.say((error as Error).message);
-      if (error instanceof ApiError && error.kind === "busy") this.timer = window.setTimeout(() => void this.ask(asked), AGAIN_MS);
+      if (turn !== this.turn) return;
+      this.isPending = false;
+      const isBusy = error instanceof ApiError && error.kind === "busy";
+      if (this.isOld || !isBusy) {
+        this.isOld = true;
+        this.changes = null;
+        this.things = [];
+        this.panel.say((error as Error).message);
+      }
+      if (isBusy) this.askIn(AGAIN_MS);
     }
   }
 
