@@ -38,9 +38,11 @@ export interface FloorPlan {
   /** Colour of the highest coloured node, red, green, blue and 1; and the hottest, K, 0: none. */
   readonly colours: Uint8Array;
   readonly kelvins: Float32Array;
-  /** Areas, m²: seen, and gaps. */
+  /** Edge of the coarsest node, m, where some are coarser than voxels; 0: none is. */
+  readonly coarseM: number;
+  /** Areas, m²: seen, and gaps; null: coarse nodes cover what would be one. */
   readonly seenM2: number;
-  readonly gapsM2: number;
+  readonly gapsM2: number | null;
 }
 
 /** Slab of a storey; without floors all heights are one. */
@@ -74,14 +76,16 @@ export function floorPlanOf(cells: Cells, floorsM: readonly number[], storey: nu
     coloured: new Float32Array(count).fill(-Infinity),
   };
   const floorM = floorsM[storey] ?? null;
+  const voxelM = cells.edgeM / 2 ** cells.depthMax;
+  let coarseM = 0;
   for (const { bytes, depth, box, wanted, isEmpty } of drawn) {
     const edgeM = cells.edgeM / 2 ** depth;
     if (!bytes.length && wanted === 0 && !isEmpty) fillSquare(raster, box.min.x, box.min.y, cells.edgeM, (at) => (raster.kinds[at] ||= ABSENT));
+    if (bytes.length && depth < cells.depthMax) coarseM = Math.max(coarseM, edgeM);
     for (let at = 0; at < bytes.length; at += STRIDE) {
       const z = box.min.z + (bytes[at + 2] + 0.5) * edgeM;
-      if (z < lowM || z > highM || bytes[at + 3] / 255 < uniforms.uMinP.value) continue;
-      const overM = floorM === null ? Infinity : z + edgeM / 2 - floorM;
-      const kind = floorM === null ? THING : overM >= WALL_M ? WALL : overM >= THING_M + edgeM / 2 ? THING : FLOOR;
+      if (!isWithin(z, edgeM, voxelM, [lowM, highM]) || bytes[at + 3] / 255 < uniforms.uMinP.value) continue;
+      const kind = kindOf(z, edgeM, voxelM, floorM);
       const kelvin = bytes[at + 7] & WARM ? (bytes[at + 10] + 256 * bytes[at + 11]) * HEAT_STEP_K + HEAT_ZERO_K : 0;
       fillSquare(raster, box.min.x + bytes[at] * edgeM, box.min.y + bytes[at + 1] * edgeM, edgeM, (to) => {
         if (raster.kinds[to] === ABSENT || raster.kinds[to] < kind) raster.kinds[to] = kind;
@@ -92,7 +96,22 @@ export function floorPlanOf(cells: Cells, floorsM: readonly number[], storey: nu
       });
     }
   }
-  return cropped({ ...raster, lowM, highM });
+  return cropped({ ...raster, lowM, highM, coarseM });
+}
+
+/** A voxel lies in a slab with its centre, a coarser node with any part of it: what it stands for may be there. */
+export function isWithin(z: number, edgeM: number, voxelM: number, [lowM, highM]: readonly [number, number]): boolean {
+  const reachM = (edgeM - voxelM) / 2;
+  return z + reachM >= lowM && z - reachM <= highM;
+}
+
+/** Kind of the column that a node is in, by its centre's height and its edge, m; a coarse node that holds the floor's voxels is floor. */
+export function kindOf(z: number, edgeM: number, voxelM: number, floorM: number | null): number {
+  if (floorM === null) return THING;
+  // Heights of its lowest voxel's centre, and of its top, over the floor; floors are flat to half a voxel.
+  const [lowestM, topM] = [z - (edgeM - voxelM) / 2 - floorM, z + edgeM / 2 - floorM];
+  if (z - floorM < THING_M || (edgeM > voxelM && lowestM < voxelM / 2)) return FLOOR;
+  return topM >= WALL_M ? WALL : THING;
 }
 
 /** Columns along a cell: as fine as voxels, as far as there is room. */
@@ -137,7 +156,7 @@ function cropped(raster: Omit<FloorPlan, "seenM2" | "gapsM2">): FloorPlan | null
   const area = (is: (kind: number) => boolean) => found.kinds.reduce((sum, kind) => sum + (is(kind) ? 1 : 0), 0) * edgeM ** 2;
   return {
     ...raster, ...found, x: raster.x + left * edgeM, y: raster.y + low * edgeM, width: wide, height: tall,
-    seenM2: area((kind) => kind >= FLOOR && kind <= WALL), gapsM2: area((kind) => kind === GAP),
+    seenM2: area((kind) => kind >= FLOOR && kind <= WALL), gapsM2: raster.coarseM ? null : area((kind) => kind === GAP),
   };
 }
 

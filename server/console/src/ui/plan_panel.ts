@@ -16,6 +16,8 @@ const NEAR_PX = 16;
 /** Pixels of a plan on paper to one of its words. */
 const PAPER_RATIO = 1.4;
 
+const NOTHING = "Nothing of this storey is in the map.";
+
 /** What the plan shows of the rest of the page, and does to it. */
 export interface PlanSource {
   ink(): PlanInk;
@@ -71,6 +73,8 @@ export class PlanPanel {
 
   /** A few times a second: a new raster where the map changed, and what lies over it. */
   tick(): void {
+    this.small.hidden = this.isOpen || !this.plan;
+    if (!this.isOpen && this.plan && !this.small.checkVisibility()) return; // narrow pages have no room for it
     const { floorsM } = this.heights.storeys;
     if (!this.isChosen) this.storey = storeyAt(floorsM, this.stage.view.target[2]);
     const madeOf = JSON.stringify([this.cells.head, this.cells.drawn, floorsM, this.storey]);
@@ -83,10 +87,6 @@ export class PlanPanel {
       this.drawnOf = "";
     }
     this.small.hidden = this.isOpen || !this.plan;
-    if (!this.plan) {
-      this.said.textContent = "Nothing of this storey is in the map.";
-      return;
-    }
     const marks = this.marks(this.storey);
     const { clientWidth, clientHeight } = this.canvas.parentElement!;
     const ink = this.source.ink();
@@ -94,7 +94,7 @@ export class PlanPanel {
     if (drawnOf === this.drawnOf) return;
     this.drawnOf = drawnOf;
     if (this.isOpen) this.draw(this.plan, ink, marks, floorsM, clientWidth, clientHeight);
-    else drawPlan(this.corner, this.plan, ink, marks, 1);
+    else if (this.plan) drawPlan(this.corner, this.plan, ink, marks, 1);
   }
 
   /** Plans of all storeys for a report, from the lowest: drawn for paper. */
@@ -107,17 +107,19 @@ export class PlanPanel {
       const canvas = h("canvas", { width, height, role: "img", "aria-label": said(plan, marks.findings.length) });
       drawPlan(canvas, plan, { ...this.source.ink(), theme: "light" }, marks, PAPER_RATIO);
       const name = floorsM.length > 1 ? storeyName(storey, floorM - floorsM[0]) : floorsM.length ? "The storey, to 2 m over its floor" : "All heights";
-      return [{ name, canvas, said: areas(plan) }];
+      const { waiting } = this.cells;
+      return [{ name, canvas, said: waiting ? `${areas(plan)} ${waiting} cells of the map were still on their way.` : areas(plan) }];
     });
   }
 
-  private draw(plan: FloorPlan, ink: PlanInk, marks: PlanMarks, floorsM: readonly number[], width: number, height: number): void {
+  /** `plan`: null where nothing of the storey is in the map. */
+  private draw(plan: FloorPlan | null, ink: PlanInk, marks: PlanMarks, floorsM: readonly number[], width: number, height: number): void {
     const ratio = devicePixelRatio;
     this.canvas.width = width * ratio;
-    this.canvas.height = height * ratio;
-    drawPlan(this.canvas, plan, ink, marks, ratio);
-    this.canvas.setAttribute("aria-label", said(plan, marks.findings.length));
-    this.said.textContent = `${areas(plan)} Click to fly there.`;
+    this.canvas.height = height * ratio; // which clears it
+    if (plan) drawPlan(this.canvas, plan, ink, marks, ratio);
+    this.canvas.setAttribute("aria-label", plan ? said(plan, marks.findings.length) : NOTHING);
+    this.said.textContent = plan ? `${areas(plan)} Click to fly there.` : NOTHING;
     const button = (floorM: number, storey: number) => h(
       "button", { type: "button", "aria-pressed": String(storey === this.storey), onclick: () => this.turnTo(storey) }, storeyName(storey, floorM - floorsM[0]),
     );
@@ -158,7 +160,8 @@ export class PlanPanel {
   }
 }
 
-function areas({ seenM2, gapsM2 }: FloorPlan): string {
+function areas({ seenM2, gapsM2, coarseM }: FloorPlan): string {
+  if (gapsM2 === null) return `Coarse, ± ${Math.ceil(100 * coarseM)} cm: about ${seenM2.toFixed(0)} m² were seen, and gaps within it are not measured; striped: no surface was seen there.`;
   const gaps = gapsM2 >= 0.1 ? ` ${gapsM2.toFixed(1)} m² within it, in amber, were never seen.` : "";
   return `${seenM2.toFixed(0)} m² were seen; striped: no surface was seen there.${gaps}`;
 }

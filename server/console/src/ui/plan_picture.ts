@@ -99,8 +99,18 @@ function drawFog(context: CanvasRenderingContext2D, { fog, stripe }: { fog: Rgb;
   context.fillRect(0, 0, context.canvas.width, context.canvas.height);
 }
 
+/** The raster of each plan that was drawn last, and its ink: an eye that moves needs no other one. */
+const rasters = new WeakMap<FloorPlan, { of: string; raster: OffscreenCanvas }>();
+
+function rasterOf(plan: FloorPlan, ink: PlanInk): OffscreenCanvas {
+  const of = JSON.stringify(ink);
+  let kept = rasters.get(plan);
+  if (kept?.of !== of) rasters.set(plan, (kept = { of, raster: makeRaster(plan, ink) }));
+  return kept.raster;
+}
+
 /** One pixel a column, clear where there is fog. */
-function rasterOf({ width, height, kinds, colours, kelvins }: FloorPlan, { theme, field, rangeK }: PlanInk): OffscreenCanvas {
+function makeRaster({ width, height, kinds, colours, kelvins }: FloorPlan, { theme, field, rangeK }: PlanInk): OffscreenCanvas {
   const image = new ImageData(width, height);
   const ground = GROUNDS[theme];
   for (let b = 0; b < height; b++) {
