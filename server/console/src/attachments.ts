@@ -7,11 +7,16 @@
 import type { Api } from "./api.ts";
 import { h } from "./dom.ts";
 import type { Mark } from "./messages.ts";
+import { sizeOf } from "./picture_size.ts";
 import { sha256 } from "./sha256.ts";
 
-/** Pictures larger than this are not decoded: bytes of a file, and pixels of its longer side that are painted. */
+/** Pictures larger than this are not decoded: bytes of a file, and pixels that it says it has. */
 const LARGEST_BYTES = 2 ** 24;
+const LARGEST_PX = 40e6;
+/** Pixels of the longer side that are painted. */
 const LONGEST_PX = 1024;
+const TOO_LARGE = "The picture is larger than the page shows.";
+const UNREADABLE = "What is attached cannot be read as a picture.";
 const IMAGES = ["image/png", "image/jpeg", "image/webp"];
 /** Pictures that are kept. */
 const KEPT = 30;
@@ -62,12 +67,16 @@ export class Attachments {
   }
 
   private async load({ sha256: digest, size_bytes }: Attachment): Promise<ImageBitmap> {
-    if (size_bytes > LARGEST_BYTES) throw new Error("The picture is larger than the page shows.");
+    if (size_bytes > LARGEST_BYTES) throw new Error(TOO_LARGE);
     const answer = await this.api.ask(`maps/${this.map}/main/attachments/${digest}`);
     const bytes = new Uint8Array(await answer.arrayBuffer());
     if (sha256(bytes) !== digest) throw new Error("What came is not the picture that the mark names.");
     const type = (answer.headers.get("Content-Type") ?? "").split(";")[0].trim();
     if (!IMAGES.includes(type)) throw new Error("What is attached is not a picture that the page shows.");
+    // A few kilobytes may decode to gigabytes.
+    const size = sizeOf(bytes);
+    if (!size) throw new Error(UNREADABLE);
+    if (size.width * size.height > LARGEST_PX) throw new Error(TOO_LARGE);
     try {
       const whole = await createImageBitmap(new Blob([bytes], { type }));
       const scale = Math.min(LONGEST_PX / Math.max(whole.width, whole.height), 1);
@@ -76,7 +85,7 @@ export class Attachments {
       whole.close();
       return small;
     } catch {
-      throw new Error("What is attached cannot be read as a picture.");
+      throw new Error(UNREADABLE);
     }
   }
 }
