@@ -39,25 +39,43 @@ export class Timeline {
   readonly entries = new Map<number, LogEntry>();
   /** Length of the map's epochs, s; null: each commit has a time of its own. */
   private readonly epochS: number | null;
+  /** Entries at the log's end were forgotten for older ones. */
+  private isCut = false;
   private made: readonly Commit[] | null = null;
+  /** Times of capture of commits that are no retract, s, rising, and the moments: made of `made`. */
+  private madeTimesS: Float64Array | null = null;
+  private madeMoments: readonly Moment[] | null = null;
 
   constructor(epochS: number | null) {
     this.epochS = epochS;
   }
 
-  /** `keepsOld`: where there are too many, those of the other end are forgotten. */
+  /** `keepsOld`: where there are too many, those of the other end are forgotten.
+   *
+   * Once the newest were forgotten, only what adjoins is taken: an event would leave a hole before it, which no button reads. */
   add(entries: readonly LogEntry[], keepsOld = false): void {
-    for (const entry of entries) this.entries.set(entry.seq, entry);
+    let last = this.isCut ? this.lastSeq : Infinity;
+    for (const entry of entries) {
+      if (entry.seq > last + 1) break;
+      last = Math.max(last, entry.seq);
+      this.entries.set(entry.seq, entry);
+    }
     if (this.entries.size > HELD_MAX) {
       const seqs = [...this.entries.keys()].sort((a, b) => (keepsOld ? b - a : a - b));
       for (const seq of seqs.slice(0, seqs.length - HELD_MAX)) this.entries.delete(seq);
+      this.isCut ||= keepsOld;
     }
-    this.made = null;
+    this.changed();
   }
 
   forget(): void {
     this.entries.clear();
-    this.made = null;
+    this.isCut = false;
+    this.changed();
+  }
+
+  private changed(): void {
+    this.made = this.madeTimesS = this.madeMoments = null;
   }
 
   get firstSeq(): number {
@@ -85,6 +103,10 @@ export class Timeline {
 
   /** Moments at which the map changed, rising: what was taken out is in none. */
   get moments(): readonly Moment[] {
+    return (this.madeMoments ??= this.findMoments());
+  }
+
+  private findMoments(): readonly Moment[] {
     const found: Moment[] = [];
     for (const { entry, out, isRetract } of this.commits) {
       if (out || isRetract || !entry.captured_s) continue;
@@ -98,12 +120,20 @@ export class Timeline {
   momentAt(timeS: number): Moment {
     if (this.epochS) return { atS: timeS, key: String(Math.floor(timeS / this.epochS)) };
     // Between two commits nothing changes, so these times are one moment.
-    let lastS: number | null = null;
-    for (const { entry, isRetract } of this.commits) {
-      const measuredS = isRetract ? undefined : entry.captured_s?.[1];
-      if (measuredS !== undefined && measuredS <= timeS) lastS = measuredS;
+    const timesS = this.timesS;
+    let [at, end] = [0, timesS.length];
+    while (at < end) {
+      const middle = (at + end) >> 1;
+      if (timesS[middle]! <= timeS) at = middle + 1;
+      else end = middle;
     }
-    return lastS === null ? { atS: timeS, key: String(timeS) } : { atS: lastS, key: String(lastS) };
+    const lastS = at ? timesS[at - 1]! : timeS;
+    return { atS: lastS, key: String(lastS) };
+  }
+
+  private get timesS(): Float64Array {
+    this.madeTimesS ??= Float64Array.from(this.commits.flatMap(({ entry, isRetract }) => (!isRetract && entry.captured_s ? [entry.captured_s[1]] : []))).sort();
+    return this.madeTimesS;
   }
 }
 
