@@ -60,11 +60,12 @@ export class TeamPanel {
     full: readonly FullShare[],
   ): void {
     const rows = branches.map((branch) => rowOf(branch, signs.get(branch.branch), followed, full)).sort(bySeverity);
-    const state = JSON.stringify(rows);
-    if (state === this.shown) return;
+    const isDetailed = rows.length <= DETAILED;
+    const state = JSON.stringify(rows.map((row) => (isDetailed || row.followed ? row : shortOf(row))));
+    // A button is not replaced between press and release, which would be no click.
+    if (state === this.shown || this.list.querySelector("button:active")) return;
     this.shown = state;
     this.summary.textContent = rows.length > 1 ? summaryOf(rows) : "";
-    const isDetailed = rows.length <= DETAILED;
     const active = (document.activeElement as HTMLElement | null)?.dataset.robot;
     fill(this.list, ...rows.map((row) => this.row(row, names, isDetailed || row.followed)), rows.length ? null : h("li", { class: "hint" }, "None registered."));
     if (active) this.list.querySelector<HTMLElement>(`[data-robot="${active}"]`)?.focus();
@@ -109,6 +110,11 @@ function rowOf(branch: Branch, sign: RobotSign | undefined, followed: string | n
     full: full.find(({ robot }) => robot === branch.branch)?.said ?? "",
     sigma: pose?.sigma_m ? `pose ± ${pose.sigma_m.toFixed(2)} m` : "",
   };
+}
+
+/** A row without what one line has no room for, such as when it was seen, which changes each second. */
+function shortOf(row: Row): Row {
+  return { ...row, seen: "", lag: "", missing: "", waiting: "", sigma: "", battery: row.trouble === "battery" ? row.battery : null };
 }
 
 /** The gravest trouble first, and among equals by name: a line moves only when a state changes. */
