@@ -4,7 +4,7 @@ import type { CellEntry, CellIndex, Triple } from "./messages.ts";
 import { noteServerDate, noteTrust } from "./server_time.ts";
 
 const TOKEN_KEY = "cairn.token";
-const INDEX_PAGE = 10_000;
+export const INDEX_PAGE = 10_000;
 
 /** What the server refused, in its own words; `kind` is the code of PROTOCOL.md section 5. */
 export class ApiError extends Error {

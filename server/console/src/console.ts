@@ -146,7 +146,7 @@ export class Console {
       fly: (to) => this.camera.go(to), look: () => this.apply(), say: (text) => this.say(text), isOperator: () => this.duties.isOperator,
       witness: (commit) => this.book.placeOf(commit),
       link: (id) => showLink("This finding", new URL(toHash(info.name, look, null, id), document.baseURI).href),
-      plans: (width, height) => this.plan.pictures(width, height),
+      plans: (width, height) => this.plan.pictures(width, height), moment: () => ({ name: this.time.moment, words: this.time.words }),
     });
     this.stage.add(this.findings.pins.group);
     view.append(this.findings.pins.element, this.findings.alarm.banner);
@@ -186,13 +186,15 @@ export class Console {
   }
 
   /** Show what another address of this map says: a link, or Back. */
-  take(look: Look, camera: CameraView): void {
+  take(look: Look, camera: CameraView | null): void {
     Object.assign(this.look, look, { boxes: look.boxes ?? this.look.boxes });
     this.heights.forget();
     this.time.follow();
     this.team.follow(null);
-    this.stage.place(camera);
-    this.camera.isPlaced = true;
+    if (camera) {
+      this.stage.place(camera);
+      this.camera.isPlaced = true;
+    }
     this.kept.followed();
     this.apply();
   }

@@ -41,6 +41,8 @@ export interface DeskActs {
   /** Show a link to a finding. */
   link(id: string): void;
   plans: ReportSource["plans"];
+  /** The past moment that is shown, for each plan, and all that is to be said of it; empty: now. */
+  moment(): { name: string; words: string };
 }
 
 export class FindingsDesk {
@@ -85,7 +87,7 @@ export class FindingsDesk {
     this.panel.onMarking = () => (this.isMarking ? this.stopMarking() : this.startMarking());
     this.panel.onFile = (form) => this.save(form);
     this.panel.onReport = () =>
-      void openReport({ api, info, attachments: this.attachments, findings: this.all, plans: (width, height) => this.acts.plans(width, height) });
+      void openReport({ api, info, attachments: this.attachments, findings: this.all, plans: (width, height) => this.acts.plans(width, height), moment: () => this.acts.moment() });
     this.panel.onThreshold = (value) => {
       localStorage.setItem(THRESHOLD_KEY, String(value));
       this.spots.setThreshold(value);

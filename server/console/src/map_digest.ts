@@ -11,6 +11,8 @@ export interface MapDigest {
   /** null: the map changed while it was read. */
   readonly digest: string | null;
   readonly cells: number;
+  /** Commits at the cursor. */
+  readonly commits: number;
 }
 
 /** SHA-256 over a line of each cell, in the order of the index: its number and its own digest. */
@@ -22,8 +24,8 @@ export function digestOf(cells: readonly Pick<CellEntry, "cell" | "digest">[]): 
 export async function digestOfMap(api: Api, map: string): Promise<MapDigest> {
   for (let left = TRIES; ; left--) {
     const { cursor, entries } = await api.cells(map);
-    const after = (await api.json<MapInfo>(`maps/${map}`)).cursor;
-    if (after === cursor) return { cursor, digest: digestOf(entries), cells: entries.length };
-    if (left === 1) return { cursor: after, digest: null, cells: entries.length };
+    const { cursor: after, commits } = await api.json<MapInfo>(`maps/${map}`);
+    if (after === cursor) return { cursor, digest: digestOf(entries), cells: entries.length, commits };
+    if (left === 1) return { cursor: after, digest: null, cells: entries.length, commits };
   }
 }

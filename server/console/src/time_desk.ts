@@ -145,6 +145,12 @@ export class TimeDesk {
     return `The map as it was ${momentText(atS, this.info.epoch_s ?? null)}, without what was taken out since. Robots, findings and ages are of now.${gaps}`;
   }
 
+  /** The moment that is shown, in words; empty: now. */
+  get moment(): string {
+    const { atS } = this.look;
+    return atS === null ? "" : `as it was ${momentText(atS, this.info.epoch_s ?? null)}`;
+  }
+
   private tell(): void {
     const { atS, sinceS } = this.look;
     const text = (timeS: number | null) => momentText(timeS, this.info.epoch_s ?? null);

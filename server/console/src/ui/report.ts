@@ -2,10 +2,11 @@
  *
  * A page of its own over the console, which the browser prints; style.css has what goes on paper. */
 
-import type { Api } from "../api.ts";
+import { INDEX_PAGE, type Api } from "../api.ts";
 import { attachmentOf, type Attachments } from "../attachments.ts";
 import { facts, fill, h } from "../dom.ts";
 import type { Finding } from "../findings.ts";
+import { robotOf } from "../log_book.ts";
 import { authorOf } from "../mark_book.ts";
 import { digestOfMap, type MapDigest } from "../map_digest.ts";
 import type { Branch, MapInfo } from "../messages.ts";
@@ -25,6 +26,8 @@ export interface ReportSource {
   readonly attachments: Attachments;
   readonly findings: readonly Finding[];
   plans(width: number, height: number): { name: string; canvas: HTMLCanvasElement; said: string }[];
+  /** The past moment that plans show, for each of them, and all that is to be said of it; empty: now. */
+  moment(): { name: string; words: string };
 }
 
 /** Put the report over the page; Escape, or its button, shuts it. */
@@ -48,12 +51,15 @@ export async function openReport(source: ReportSource): Promise<void> {
     const [digest, branches, pictures] = await Promise.all([
       digestOfMap(api, info.name), api.json<Branch[]>(`maps/${info.name}/branches`), picturesOf(source),
     ]);
-    const plans = source.plans(PLAN.width, PLAN.height).map(({ name, canvas, said }) => h("figure", { class: "storey" }, h("figcaption", {}, `${name}: ${said}`), canvas));
+    // Cursor and digest are always of now.
+    const moment = source.moment();
+    const plans = source.plans(PLAN.width, PLAN.height).map(({ name, canvas, said }) =>
+      h("figure", { class: "storey" }, h("figcaption", {}, `${[name, moment.name].filter(Boolean).join(", ")}: ${said}`), canvas));
     const comment = h("textarea", { rows: "3", "aria-label": "Remarks, which are printed", placeholder: "Remarks, which are printed" });
     const write = () => {
       const zone = zoneOf(zones.value);
       fill(
-        body, h("h1", {}, `Report of the map ${info.name}`), head(info, digest, zone.format(madeS)), comment,
+        body, h("h1", {}, `Report of the map ${info.name}`), head(info, digest, zone.format(madeS), moment.words), comment,
         h("h2", {}, "Plans"), ...plans, h("h2", {}, "Findings"), table(source.findings, zone),
         pictures.length > 0 && h("h2", {}, "Pictures"), ...pictures, h("h2", {}, "Robots"), team(branches, zone), h("h2", {}, "Proof"), proof(info, digest),
       );
@@ -69,11 +75,12 @@ export async function openReport(source: ReportSource): Promise<void> {
   }
 }
 
-function head({ geometry, commits }: MapInfo, { cursor, digest, cells }: MapDigest, made: string): HTMLElement {
+function head({ geometry }: MapInfo, { cursor, digest, cells, commits }: MapDigest, made: string, past: string): HTMLElement {
   return facts([
     ["made", made], ["server", new URL(".", document.baseURI).href], ["cursor", h("code", {}, cursor)],
     ["digest", digest ? h("code", {}, digest) : "none: the map changed while it was read"],
     ["map", `${thousands(cells)} cells, ${thousands(commits)} commits, voxels of ${metres(geometry.voxel_edge_um / 1e6)}`],
+    ...(past ? [["plans", `${past} Cursor and digest are of now.`] as [string, string]] : []),
   ]);
 }
 
@@ -86,7 +93,7 @@ function table(findings: readonly Finding[], zone: Zone): HTMLElement {
     return [
       String(number), title, celsius === null ? "" : `${celsius.toFixed(1)} °C${spot ? ` ± ${spot.sigma.toFixed(1)}` : ""}`,
       place.map((each) => each.toFixed(2)).join(", "), spot?.over_floor_m == null ? "" : metres(spot.over_floor_m, 1),
-      spot && !spot.confirmed ? `${state}, perhaps a ghost` : state, entry ? authorOf(entry) : (spot?.commit?.split(".")[0] ?? ""),
+      spot && !spot.confirmed ? `${state}, perhaps a ghost` : state, entry ? authorOf(entry) : (spot?.commit ? robotOf(spot.commit) : ""),
       timeS === undefined ? "" : zone.format(timeS), entry?.mark.note ?? "",
     ];
   });
@@ -101,10 +108,13 @@ function table(findings: readonly Finding[], zone: Zone): HTMLElement {
 /** Pictures of marks, as figures with the finding's number; what cannot be shown is said. */
 async function picturesOf({ findings, attachments }: ReportSource): Promise<HTMLElement[]> {
   const with_ = findings.flatMap(({ number, entry, state }) => (entry && state === "mark" && attachmentOf(entry.mark) ? [{ number, mark: entry.mark }] : []));
-  return Promise.all(with_.slice(0, PICTURES_MAX).map(async ({ number, mark }) => {
+  const figures: HTMLElement[] = [];
+  // One after another: each may be large while it is decoded.
+  for (const { number, mark } of with_.slice(0, PICTURES_MAX)) {
     const picture = await attachments.picture(mark, PICTURE_PX).catch((error: unknown) => h("p", {}, (error as Error).message));
-    return h("figure", { class: "picture" }, picture, h("figcaption", {}, `${number}: ${mark.name}`));
-  }));
+    figures.push(h("figure", { class: "picture" }, picture, h("figcaption", {}, `${number}: ${mark.name}`)));
+  }
+  return figures;
 }
 
 function team(branches: readonly Branch[], zone: Zone): HTMLElement {
@@ -114,8 +124,14 @@ function team(branches: readonly Branch[], zone: Zone): HTMLElement {
 }
 
 function proof({ name }: MapInfo, { cursor, digest }: MapDigest): HTMLElement {
-  const url = new URL(`maps/${name}/main/cells?limit=10000`, document.baseURI).href;
-  const command = `curl -s -H 'Cairn-Format: 4' -H "Authorization: Bearer $CAIRN_TOKEN" '${url}' | jq -r '.cells[] | "\\(.cell | join(",")) \\(.digest)"' | sha256sum`;
+  const url = new URL(`maps/${name}/main/cells?limit=${INDEX_PAGE}`, document.baseURI).href;
+  // Page after page: an empty one ends the index.
+  const command = [
+    "last=",
+    `while page=$(curl -sf -H 'Cairn-Format: 4' -H "Authorization: Bearer $CAIRN_TOKEN" "${url}$last") &&`,
+    `    lines=$(printf %s "$page" | jq -r '.cells[] | "\\(.cell | join(",")) \\(.digest)"') && [ -n "$lines" ]`,
+    `do printf '%s\\n' "$lines"; last="&after=$(printf '%s\\n' "$lines" | tail -n 1 | cut -d ' ' -f 1)"; done | sha256sum`,
+  ].join("\n");
   return h(
     "div", {},
     h("p", {}, digest ? `The digest is the SHA-256 over a line of each cell, its number and its digest, at the cursor ${cursor}. A server whose map is at this cursor, also one made of a backup, gives the same:`
