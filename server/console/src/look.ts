@@ -52,6 +52,9 @@ export function defaultLook(): Look {
 /** Findings as addresses name them: a mark by its key, a hot spot by its hottest voxel. */
 const FIND = /^(mark [a-z0-9._-]+:\d+|spot -?\d+,-?\d+,-?\d+)$/;
 
+/** Times beyond this are none: a date of the page's clock ends at 8.64e12 s; s from 1970. */
+const TIME_MAX_S = 1e11;
+
 /** The part of an address behind #; `find`: the finding that it leads to. */
 export function toHash(map: string, look: Look, camera: CameraView | null, find: string | null = null): string {
   const parts: [string, string][] = [["map", map]];
@@ -98,8 +101,12 @@ export function fromHash(hash: string): { map: string | null; look: Look; camera
   look.band = band && band[0] !== null ? (band as [number, number | null]) : null;
   look.cells = given.get("cells") === "1";
   look.boxes = given.has("boxes") ? given.get("boxes") === "1" : null;
-  look.atS = one("at");
-  look.sinceS = one("since");
+  const time = (name: string) => {
+    const timeS = one(name);
+    return timeS !== null && Math.abs(timeS) <= TIME_MAX_S ? timeS : null;
+  };
+  look.atS = time("at");
+  look.sinceS = time("since");
   const eye = numbers("eye", 3) as Triple | null;
   const target = numbers("target", 3) as Triple | null;
   const map = given.get("map") ?? null;

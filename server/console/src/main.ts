@@ -123,8 +123,10 @@ listen(keys);
 // A shared link that is opened where the page already is, or Back after a flight.
 function follow(): void {
   const { map, look, camera, find } = fromHash(location.hash);
-  if (open && open.name === map && find) open.findings.seek(find);
-  else if (open && open.name === map && camera) open.take(look, camera);
+  if (open && open.name === map && find) {
+    open.take(look, camera);
+    open.findings.seek(find);
+  } else if (open && open.name === map && camera) open.take(look, camera);
   else void start();
 }
 window.addEventListener("hashchange", follow);
