@@ -80,10 +80,12 @@ class CrowdRobot:
                 return
         raise BadAnswerError("no end of the first fetch")
 
-    async def live(self, crowd: Crowd, first_s: float, end_s: float) -> None:
-        """Rounds until the end."""
-        offset = self._number * crowd.pushes_each // crowd.robots
-        number, due_s = 0, first_s
+    async def live(self, crowd: Crowd, phase_s: float, end_s: float) -> None:
+        """Rounds until the end, at times after `phase_s` that are whole multiples of `sync_s`."""
+        # Robots with neighbouring numbers have rounds right after each other, so each pushes in another round.
+        offset = self._number % crowd.pushes_each
+        number = int((time.perf_counter() - phase_s) // crowd.sync_s) + 1
+        due_s = phase_s + number * crowd.sync_s
         while due_s < end_s:
             await asyncio.sleep(due_s - time.perf_counter())
             try:
@@ -164,8 +166,7 @@ async def live_together(crowd: Crowd, robots: list[CrowdRobot], seen: Seen, *, s
             return
         # Where its rounds would be, had it been there from the start: so they are spread evenly.
         phase_s = start_s + crowd.sync_s * number / crowd.robots
-        rounds = int((time.perf_counter() - phase_s) // crowd.sync_s) + 1
-        await robot.live(crowd, phase_s + rounds * crowd.sync_s, end_s)
+        await robot.live(crowd, phase_s, end_s)
 
     await asyncio.gather(*(one(number, robot) for number, robot in enumerate(robots)))
 
