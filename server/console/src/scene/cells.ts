@@ -126,7 +126,8 @@ export class Cells {
     this.onChange(true);
   }
 
-  private get momentKey(): string {
+  /** Key of the moment that is shown; empty: now. */
+  get momentKey(): string {
     return this.moment?.key ?? "";
   }
 
