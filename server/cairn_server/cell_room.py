@@ -128,6 +128,14 @@ def changed_bytes(geometry: Geometry, voxels: int, *, rows: int = 1) -> int:
     return _each_bytes(CHANGED_BYTES, geometry) * min(voxels, rows * voxels_of_cell(geometry))
 
 
+def compared_bytes(geometry: Geometry, voxels: int) -> int:
+    """Most memory that a cell of so many voxels takes that is decoded, and compared with itself less a part.
+
+    Measured of a cell of 400 000 voxels that one commit made all of: the part, the cell, and what is left of it.
+    """
+    return 2 * decoded_bytes(geometry, voxels)
+
+
 def _each_bytes(parts: tuple[int, int, int], geometry: Geometry) -> int:
     counts, sampled, plane = parts
     return counts + (sampled if geometry.plane_count else 0) + plane * geometry.plane_count
