@@ -212,17 +212,17 @@ class Service:
         )
 
     def _view_parts(self) -> ViewParts:
-        exports = MapExports(self.store, self.cells)
+        exports, changes = MapExports(self.store, self.cells), MapChangesSearch(self.store, self.cells)
         return ViewParts(
             CellViews(self.store, self.cells),
             MapViews(self.store, self.cells, cache_share=self.settings.memory.cache_share),
             exports,
             ExportTickets(self.store, self.holders, exports),
-            MapChangesSearch(self.store, self.cells),
+            changes,
             HottestSearch(self.store, self.cells),
             HotSpotSearch(self.store, self.cells, cache_share=self.settings.memory.cache_share),
             ValueSpread(self.store, self.cells),
-            RetractPreviews(self.store, self.cells),
+            RetractPreviews(self.store, self.cells, turn=changes.turn),
         )
 
     def _folded(self, row: MapRow) -> None:

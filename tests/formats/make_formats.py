@@ -3,8 +3,8 @@
     python -m tests.formats.make_formats
 
 writes the files that are missing, never over one that is there: if the code writes other bytes today, the old ones
-must still decode. What they decode to is in `v1.json` to `v4.json`. `before-epochs.*.zst` are a store, a backup
-and a robot's folder of the last version without epochs.
+must still decode. What they decode to is in the JSON files. `before-epochs.*.zst` are a store, a backup and a
+robot's folder of the last version without epochs.
 """
 
 import json
@@ -23,7 +23,15 @@ from cairn_map.commits.mark import make_mark
 from cairn_map.epochs.cell_history import CellHistory, cell_history, history_fingerprint
 from cairn_map.epochs.epoch import BASE, Epoch
 from cairn_map.epochs.layer import LayerDefinition, MapLayer
-from cairn_map.evidence.channels import COLOUR, INTENSITY, TEMPERATURE, Channel, ChannelKind, classes_channel
+from cairn_map.evidence.channels import (
+    COLOUR,
+    HEIGHT_OFFSET,
+    INTENSITY,
+    TEMPERATURE,
+    Channel,
+    ChannelKind,
+    classes_channel,
+)
 from cairn_map.evidence.evidence import Evidence, empty_evidence, packed_evidence
 from cairn_map.evidence.fingerprint import fingerprint
 from cairn_map.evidence.grid import Geometry, cell_key
@@ -36,12 +44,18 @@ CLASS_CELL = "v1-classes.cell"
 
 EPOCH_CELLS = ("v2-fast.cell", "v2-small.cell")
 
+LAYER_CELLS = ("v1-level.cell", "v1-level-small.cell", "v1-classes-small.cell")
+"""Cells of the kinds that layers brought: flat voxels, and votes for classes."""
+LAYER_EPOCH_CELLS = ("v2-level.cell", "v2-classes.cell")
+
 FOLDER = Path(__file__).parent
 DOSE = Channel(kind=ChannelKind.SCALAR, name="dose", unit="µSv/h", step=0.01, zero=-1.5)
 SCALARS = tuple(Channel(kind=ChannelKind.SCALAR, name=name, unit="u", step=1.0) for name in ("a", "b"))
 GEOMETRY = Geometry(voxel_edge_um=40_000, depth=4, channels=(COLOUR, INTENSITY, TEMPERATURE, DOSE))
 CLASSED = Geometry(voxel_edge_um=50_000, depth=4, channels=(classes_channel(("wall", "floor", "chair")),))
+LEVEL = Geometry(voxel_edge_um=200_000, height_step_um=50_000, depth=4, channels=(HEIGHT_OFFSET,))
 LAYER = MapLayer(geometry=GEOMETRY, epoch_s=120)
+GROUND, THINGS = (MapLayer(geometry=each, epoch_s=120) for each in (LEVEL, CLASSED))
 KEY = cell_key((-3, 2, 0))
 AUTHOR = "mole.0123456789abcdef"
 
@@ -88,6 +102,34 @@ def classes() -> Evidence:
     first, second = np.where(n % 3, 1 + n % 4, 0), np.where(n % 5, 0, 300)
     samples = np.stack([first, second, 0 * n, first + second + n % 2], axis=1)
     return packed_evidence(places.astype(np.uint32), np.ones((len(places), 2), np.int32), samples, CLASSED)
+
+
+def ground() -> Evidence:
+    """Votes for the heights of a slope with a bridge above it, and bins that beams crossed."""
+    x, y, z = np.indices((16, 16, 16)).reshape(3, -1)
+    slope, bridge = z == (x + 2 * y) // 8, (z == 13) & (x > 9)
+    n = x * 7 + y * 3 + z
+    crossed = (z == (x + 2 * y) // 8 + 1) & (n % 4 == 0)
+    there, voted = slope | bridge | crossed, slope | (bridge & (y < 14))
+    w = np.where(voted, 1 + n % 3, 0)
+    counts = np.stack([np.where(slope | bridge, w + n % 2, 0), np.where(crossed, 1 + n % 5, 0)], axis=1)
+    samples = np.stack([w * (n % 10), w], axis=1)
+    voxels = zip(x[there].tolist(), y[there].tolist(), z[there].tolist(), strict=True)
+    places = np.array([interleave(*voxel) for voxel in voxels], np.uint32)
+    return packed_evidence(places, counts[there], samples[there], LEVEL)
+
+
+def layer_evidence() -> dict[str, tuple[Evidence, Geometry]]:
+    """Content of each of `LAYER_CELLS`."""
+    return dict(zip(LAYER_CELLS, ((ground(), LEVEL), (ground(), LEVEL), (classes(), CLASSED)), strict=True))
+
+
+def layer_histories() -> dict[str, tuple[CellHistory, MapLayer]]:
+    """Content of each of `LAYER_EPOCH_CELLS`."""
+    found = {}
+    for name, evidence, layer in zip(LAYER_EPOCH_CELLS, (ground(), classes()), (GROUND, THINGS), strict=True):
+        found[name] = cell_history({BASE: evidence, Epoch(14_500_000): evidence}), layer
+    return found
 
 
 def commit_bytes() -> bytes:
@@ -180,6 +222,11 @@ def made() -> dict[str, bytes]:
         "v1-signed.cell": encode_cell(KEY, evidence(-1), GEOMETRY).data,
         "v1-empty.cell": encode_cell(KEY, empty_evidence(GEOMETRY), GEOMETRY).data,
         CLASS_CELL: encode_cell(KEY, classes(), CLASSED).data,
+        **{
+            name: encode_cell(KEY, *content, profile=Profile.SMALL if "small" in name else Profile.FAST).data
+            for name, content in layer_evidence().items()
+        },
+        **{name: encode_history(KEY, *content).data for name, content in layer_histories().items()},
         "v1.commit": commit_bytes(),
         "v1.reply": reply_bytes(),
         "v2-fast.cell": encode_history(KEY, history(), LAYER).data,
@@ -258,6 +305,22 @@ def found_with_classes() -> dict[str, object]:
     }
 
 
+def found_of_layers() -> dict[str, object]:
+    """Content of the stored bytes of cells of flat voxels and of classes, as it is read today."""
+    cells = {name: decode_cell((FOLDER / name).read_bytes()) for name in LAYER_CELLS}
+    dated = {name: decode_history((FOLDER / name).read_bytes()) for name in LAYER_EPOCH_CELLS}
+    return {
+        "geometries": {name: cell.geometry.digest().hex() for name, cell in cells.items()},
+        "layers": {name: cell.layer.digest().hex() for name, cell in dated.items()},
+        "digests": {name: cell.digest.hex() for name, cell in (cells | dated).items()},
+        "fingerprints": {name: fingerprint(cell.evidence, cell.key).hex() for name, cell in cells.items()}
+        | {
+            name: history_fingerprint(cell.history, cell.key, layer_word=cell.layer.word).hex()
+            for name, cell in dated.items()
+        },
+    }
+
+
 def main() -> None:
     """Write what is missing."""
     for name, data in made().items():
@@ -277,6 +340,8 @@ def main() -> None:
         )
     if not (FOLDER / "v1-classes.json").exists():
         (FOLDER / "v1-classes.json").write_text(json.dumps(found_with_classes(), indent=1, sort_keys=True) + "\n")
+    if not (FOLDER / "layer-cells.json").exists():
+        (FOLDER / "layer-cells.json").write_text(json.dumps(found_of_layers(), indent=1, sort_keys=True) + "\n")
 
 
 if __name__ == "__main__":

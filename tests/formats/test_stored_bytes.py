@@ -12,15 +12,20 @@ from tests.formats.make_formats import (
     GEOMETRY,
     KEY,
     LAYER,
+    LAYER_CELLS,
+    LAYER_EPOCH_CELLS,
     classes,
     evidence,
     found,
+    found_of_layers,
     found_with_attachments,
     found_with_classes,
     found_with_epochs,
     found_with_layer,
     found_with_marks,
     history,
+    layer_evidence,
+    layer_histories,
     wall,
 )
 from tests.naive import cell_code as naive_cell_code
@@ -28,7 +33,7 @@ from tests.naive import history as naive_history
 
 from cairn_map.codec.cell_code import decode_canonical_cell, decode_cell, encode_cell
 from cairn_map.codec.cell_reading import cell_reader
-from cairn_map.codec.history_code import check_canonical_history, decode_history
+from cairn_map.codec.history_code import check_canonical_history, decode_history, encode_history
 from cairn_map.codec.octree.streams import MODELLED
 
 
@@ -88,3 +93,25 @@ def test_the_stored_cell_of_classes_still_means_what_it_meant() -> None:
     decoded = decode_canonical_cell((FOLDER / CLASS_CELL).read_bytes())
     assert (decoded.key, decoded.geometry, decoded.evidence) == (KEY, CLASSED, classes())
     assert encode_cell(KEY, classes(), CLASSED).digest == decoded.digest
+
+
+def test_the_stored_cells_of_levels_and_classes_still_mean_what_they_meant() -> None:
+    assert found_of_layers() == json.loads((FOLDER / "layer-cells.json").read_text())
+
+
+@pytest.mark.parametrize("name", LAYER_CELLS)
+def test_stored_cells_of_levels_and_classes_hold_what_was_put_in(name: str) -> None:
+    evidence, geometry = layer_evidence()[name]
+    decoded = decode_canonical_cell((FOLDER / name).read_bytes())
+    assert (decoded.key, decoded.geometry, decoded.evidence) == (KEY, geometry, evidence)
+    assert encode_cell(KEY, evidence, geometry).digest == decoded.digest
+
+
+@pytest.mark.parametrize("name", LAYER_EPOCH_CELLS)
+def test_stored_rows_of_levels_and_classes_hold_what_was_put_in(name: str) -> None:
+    rows, layer = layer_histories()[name]
+    data = (FOLDER / name).read_bytes()
+    check_canonical_history(data)
+    decoded = decode_history(data)
+    assert (decoded.key, decoded.layer, decoded.history) == (KEY, layer, rows)
+    assert encode_history(KEY, rows, layer).digest == decoded.digest

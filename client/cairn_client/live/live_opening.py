@@ -237,7 +237,7 @@ def _fixed_edges(index: BagIndex, mapping: BagMapping) -> tuple[RosTransform, ..
     """Poses between the base and its cameras, and the body of the topic of poses."""
     tree = index.tree
     frames = [
-        camera.frame or index.topics[camera.topic].frame
+        camera.frame or index.topics[camera.first_topic].frame
         for camera in mapping.cameras.values()
         if camera.T_base_camera is None
     ]

@@ -26,6 +26,8 @@ log = logging.getLogger(__name__)
 BAG_FILE = "scans.mcap"
 REMEMBERED = 4096
 """Messages of one topic, or poses of one frame, that are remembered as written: scans that share them are near."""
+KINDS = ("topic", "amplitude", "labels")
+"""Topics of images that a camera of the topics file may have, or lack where none of them is in the bag."""
 HEAD_BYTES = 32
 """Bytes of a message that hold its stamp: two may come at one time of a coarse clock."""
 
@@ -125,11 +127,15 @@ class ScanRecorder:
 
     def _write_topics(self) -> None:
         """Write the mapping of the cameras that are in the bag."""
-        cameras = {name: camera for name, camera in self._mapping.cameras.items() if camera.topic in self._recorded}
-        for name, camera in cameras.items():
-            if camera.amplitude is not None and camera.amplitude not in self._recorded:
-                cameras[name] = camera.model_copy(update={"amplitude": None})
-        changed = self._mapping.model_copy(update={"cameras": cameras, "corrections": None})
+        cameras = {
+            name: camera.model_copy(
+                update={kind: None for kind in KINDS if getattr(camera, kind) not in self._recorded}
+            )
+            for name, camera in self._mapping.cameras.items()
+            if self._recorded.intersection(camera.image_topics)
+        }
+        names = self._mapping.label_names if any(camera.labels for camera in cameras.values()) else {}
+        changed = self._mapping.model_copy(update={"cameras": cameras, "corrections": None, "label_names": names})
         # JSON is YAML.
         text = changed.model_dump_json(by_alias=True, exclude_defaults=True, indent=1)
         (self._folder / TOPICS_FILE).write_text(f"{text}\n", encoding="utf-8")

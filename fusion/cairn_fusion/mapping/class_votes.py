@@ -19,7 +19,7 @@ from cairn_calib.rig.rig import Rig
 from cairn_fusion.mapping.beam_returns import Returns
 from cairn_fusion.mapping.ray_casting import unique_voxels
 from cairn_fusion.mapping.samples import ImageTransfers
-from cairn_fusion.recording.scan import Scan
+from cairn_fusion.recording.scan import LabelNames, Scan
 from cairn_fusion.transfer.transfer import Label
 from cairn_map.arrays import Ints
 from cairn_map.errors import BadInputError
@@ -44,6 +44,17 @@ class PixelCounts(NamedTuple):
     """(M,) how many."""
 
 
+class CameraVotes(NamedTuple):
+    """Votes of one camera, one for each voxel."""
+
+    voxels: Ints
+    """(V, 3) different voxel numbers."""
+    winners: Ints
+    """(V,) class of each vote."""
+    weights: Ints
+    """(V,) weight of each vote, 1 to `VOTE_MAX`."""
+
+
 def classes_of_labels(scan: Scan, geometry: Geometry) -> dict[str, Ints]:
     """Class numbers (H, W) of a scan's label images, `SILENT` where one says nothing; none of a map without classes.
 
@@ -53,19 +64,31 @@ def classes_of_labels(scan: Scan, geometry: Geometry) -> dict[str, Ints]:
     channel = _channel_of(geometry)
     if channel is None or not scan.labels:
         return {}
+    check_label_names(scan.label_names, geometry)
     names = {name: number for number, name in enumerate(channel.classes)}
-    unknown = sorted({name for name in scan.label_names.values() if name is not None and name not in names})
+    number_of = np.full(max(scan.label_names, default=0) + 1, SILENT, np.int64)
+    for value, name in scan.label_names.items():
+        number_of[value] = SILENT if name is None else names[name]
+    # Each value is in the table: `check_scan` saw to it.
+    return {camera: number_of[image] for camera, image in scan.labels.items()}
+
+
+def check_label_names(label_names: LabelNames, geometry: Geometry) -> None:
+    """Refuse a table of labels for a map with other classes; a map without classes takes any.
+
+    Raises:
+        BadInputError: kind `unknown_class`: a name that the map's list lacks.
+    """
+    channel = _channel_of(geometry)
+    if channel is None:
+        return
+    unknown = sorted({name for name in label_names.values() if name is not None} - {*channel.classes})
     if unknown:
         raise BadInputError(
             "unknown_class",
             f"the labels name {', '.join(unknown[:8])}, and the map's classes are {', '.join(channel.classes)}; "
             f"name what is none of them {OTHER!r}, or add a layer with these classes",
         )
-    number_of = np.full(max(scan.label_names, default=0) + 1, SILENT, np.int64)
-    for value, name in scan.label_names.items():
-        number_of[value] = SILENT if name is None else names[name]
-    # Each value is in the table: `check_scan` saw to it.
-    return {camera: number_of[image] for camera, image in scan.labels.items()}
 
 
 class ClassVotes:
@@ -101,18 +124,28 @@ class ClassVotes:
         """One vote for each voxel and camera, by cell; without hits and misses."""
         if self._channel is None or not self._counts:
             return {}
-        parts = [self._votes_of(_summed(counts)) for _, counts in sorted(self._counts.items())]
-        voxels, voxel_of = unique_voxels(np.concatenate([voxels for voxels, _ in parts]))
+        votes = [_votes_of(_summed(counts)) for _, counts in sorted(self._counts.items())]
+        numbers, places = split_voxels(np.concatenate([each.voxels for each in votes]), self._geometry)
+        winners = np.concatenate([each.winners for each in votes])
+        weights = np.concatenate([each.weights for each in votes])
+        # Rows of all planes are made of one cell at a time: with 64 classes they take 512 bytes a voxel.
+        order = np.argsort(numbers, kind="stable")
+        cells, starts = np.unique(numbers[order], return_index=True)
+        return {
+            CellKey(cell): self._of_cell(places[rows], winners[rows], weights[rows], self._channel)
+            for cell, rows in zip(cells.tolist(), np.split(order, starts[1:]), strict=True)
+        }
+
+    def _of_cell(self, places: Ints, winners: Ints, weights: Ints, channel: Channel) -> Evidence:
+        """Votes in one cell, several for a voxel where several cameras saw it."""
+        voxels, row_of = np.unique(places, return_inverse=True)
+        planes = self._geometry.planes_of(channel.name)
         sums = np.zeros((len(voxels), self._geometry.plane_count), np.int64)
-        planes = self._geometry.planes_of(self._channel.name)
-        np.add.at(sums[:, planes], voxel_of, np.concatenate([votes for _, votes in parts]))
-        cells, places = split_voxels(voxels, self._geometry)
-        found: dict[CellKey, Evidence] = {}
-        for cell in np.unique(cells):
-            mine = cells == cell
-            no_counts = np.zeros((int(mine.sum()), 2), np.int32)
-            found[CellKey(int(cell))] = packed_evidence(places[mine], no_counts, sums[mine], self._geometry)
-        return found
+        # The last class has no plane of its own: it is the rest of the weight.
+        named = winners < len(channel.classes) - 1
+        np.add.at(sums, (row_of[named], planes.start + winners[named]), weights[named])
+        np.add.at(sums[:, planes.stop - 1], row_of, weights)
+        return packed_evidence(voxels, np.zeros((len(voxels), 2), np.int32), sums, self._geometry)
 
     def _count(self, camera: str, voxels: Ints, voxel_of: Ints, classes: Ints) -> None:
         N = len(self._channel.classes) if self._channel else 1
@@ -125,30 +158,28 @@ class ClassVotes:
             if sum(len(one.pixels) for one in held[1:]) > max(ROWS_MAX, len(held[0].pixels)):
                 held[:] = [_summed(held)]
 
-    def _votes_of(self, counts: PixelCounts) -> tuple[Ints, Ints]:
-        """(V, 3) voxels, and the (V, planes) sums of one vote for each."""
-        channel = self._channel
-        N = len(channel.classes) if channel else 1
-        voxels, voxel_of = unique_voxels(counts.voxels)
-        pixels = np.bincount(voxel_of * N + counts.classes, counts.pixels, len(voxels) * N).astype(np.int64)
-        pixels = pixels.reshape(-1, N)
-        winner = pixels.argmax(axis=1)
-        second, first = np.partition(pixels, -2, axis=1)[:, -2:].T
-        lead, total = first - second, pixels.sum(axis=1)
-        weight = np.clip(np.minimum(lead, -(-VOTE_MAX * lead // total)), 1, VOTE_MAX)
-        # The last class has no plane of its own: it is the rest of the weight.
-        votes = np.zeros((len(voxels), N), np.int64)
-        votes[np.arange(len(voxels)), winner] = weight
-        votes[:, -1] = weight
-        return voxels, votes
-
 
 def _channel_of(geometry: Geometry) -> Channel | None:
     return next((channel for channel in geometry.channels if channel.kind is ChannelKind.CLASSES), None)
 
 
+def _votes_of(counts: PixelCounts) -> CameraVotes:
+    """Votes of one camera, one for each voxel; the counts rise in voxel, and in class within one, as `_summed` are."""
+    voxels, voxel_of = unique_voxels(counts.voxels)
+    starts = np.flatnonzero(np.diff(voxel_of, prepend=-1))
+    total, first = np.add.reduceat(counts.pixels, starts), np.maximum.reduceat(counts.pixels, starts)
+    # Of classes with as many pixels the first row has the smallest number.
+    best = np.flatnonzero(counts.pixels == first[voxel_of])
+    winner_rows = best[np.unique(voxel_of[best], return_index=True)[1]]
+    rest = counts.pixels.copy()
+    rest[winner_rows] = 0
+    lead = first - np.maximum.reduceat(rest, starts)
+    weights = np.clip(np.minimum(lead, -(-VOTE_MAX * lead // total)), 1, VOTE_MAX)
+    return CameraVotes(voxels, counts.classes[winner_rows], weights)
+
+
 def _summed(parts: list[PixelCounts]) -> PixelCounts:
-    """Pixels of the same voxel and class added up."""
+    """Pixels of the same voxel and class added up, rising in voxel, in the order of `unique_voxels`, and in class."""
     if len(parts) == 1:
         return parts[0]
     voxels, voxel_of = unique_voxels(np.concatenate([part.voxels for part in parts]))

@@ -110,10 +110,18 @@ def read_labels(path: Path, size: Size | None = None) -> npt.NDArray[np.uint8 | 
     Raises:
         BadInputError: also when the file holds colours or a palette, which is a picture *of* labels.
     """
-    data = _read_regular(path)
+    return labels_of_bytes(_read_regular(path), path, size)
+
+
+def labels_of_bytes(data: bytes, path: Path | str, size: Size | None = None) -> npt.NDArray[np.uint8 | np.uint16]:
+    """The numbers in the bytes of a grey PNG file, as `read_labels`; `path` names them in errors."""
     header = _header(data, path)
-    if not header.grey8:
+    if header.grey16:
         return grey16_of_bytes(data, path, size)
+    if not header.grey8:
+        raise BadInputError(
+            "image_type", f"{path} must be a PNG with one channel of 8 or 16 bits: a picture of labels is none"
+        )
     _check_size(header, size, path)
     cv2 = opencv()
     numbers = _decode(cv2, data, cv2.IMREAD_UNCHANGED, path)

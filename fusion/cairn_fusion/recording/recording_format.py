@@ -10,6 +10,8 @@ callers choose a function by convention: `range_from_z_depth` or `range_from_rad
 
 import json
 import re
+from collections import Counter
+from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Literal
@@ -131,14 +133,18 @@ def keys_twice(text: str) -> str:
     twice: list[str] = []
 
     def seen(pairs: list[tuple[str, object]]) -> None:
-        keys = [key for key, _ in pairs]
-        twice.extend(key for key in {*keys} if keys.count(key) > 1)
+        twice.extend(repeated([key for key, _ in pairs]))
 
     try:
         json.loads(text, object_pairs_hook=seen)
     except (ValueError, RecursionError):
         return ""  # no JSON: the header's own check says so
     return min(twice, default="")
+
+
+def repeated(keys: Sequence[str]) -> list[str]:
+    """Keys that are in a list more than once; time is linear, since a table of labels has up to 65 536."""
+    return [key for key, count in Counter(keys).items() if count > 1] if len(set(keys)) < len(keys) else []
 
 
 def read_header(folder: Path) -> RecordingHeader:

@@ -6,7 +6,7 @@ A folder with `rig.json` and no `recording.json` belongs to a writer that died; 
 """
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
@@ -20,6 +20,7 @@ from cairn_fusion.recording.images import write_colour, write_labels
 from cairn_fusion.recording.recording_format import (
     BODY_FILE,
     CHANNEL,
+    HEADER_BYTES_MAX,
     HEADER_FILE,
     MEASUREMENTS_FILE,
     RIG_FILE,
@@ -32,7 +33,7 @@ from cairn_fusion.recording.recording_format import (
     encode_kelvin,
     encode_range,
 )
-from cairn_fusion.recording.scan import Scan, check_scan
+from cairn_fusion.recording.scan import LabelNames, Scan, check_scan
 from cairn_fusion.recording.trajectory import trajectory_line
 from cairn_map.errors import BadInputError, ConflictError
 
@@ -121,8 +122,8 @@ class RecordingWriter:
 
         Raises:
             BadInputError: the scan does not fit the rig, is not later than the one before, has a value that the
-                encodings cannot hold, or says where the body was when others did not, or the other way round.
-                Nothing of it is in the lists then.
+                encodings cannot hold, or a table of labels that the header cannot hold, or says where the body was
+                when others did not, or the other way round. Nothing of it is in the lists then.
         """
         if self._finished:
             raise ConflictError("recording_exists", f"{self.folder} is finished; nothing can be added")
@@ -138,10 +139,15 @@ class RecordingWriter:
             raise BadInputError("bad_scan", "either every scan of a recording says where the body was, or none does")
         if scan.labels and self._label_table not in ({}, dict(scan.label_names)):
             raise BadInputError("bad_scan", "the label images of all scans of a recording share one table")
+        recorded = self._recorded | dict.fromkeys(_images_of(scan))
+        label_table = dict(scan.label_names) if scan.labels else self._label_table
+        if (recorded, label_table) != (self._recorded, self._label_table):
+            self._check_header(recorded, label_table)
         # Images first, then their lines: a list never names a file that is missing.
         time_s = float(scan.time_s)
         for list_name, relative in self._write_images(scan).items():
             self._list(list_name).write(f"{time_s!r} {relative}\n")
+        self._recorded, self._label_table = recorded, label_table
         self._list(TRAJECTORY_FILE).write(trajectory_line(time_s, scan.T_map_rig))
         if scan.T_map_body is not None:
             self._list(BODY_FILE).write(trajectory_line(time_s, scan.T_map_body))
@@ -175,17 +181,8 @@ class RecordingWriter:
             for file in self._lists.values():
                 file.flush()
                 os.fsync(file.fileno())
-        label_table = {str(number): name for number, name in self._label_table.items()}
         # The header comes last, and in one step: it is what makes a folder a recording.
-        header = self._header.model_copy(
-            update={
-                "range": dict.fromkeys(self._cameras("range"), self._range_encoding),
-                "amplitude": tuple(self._cameras("amplitude")),
-                "colour": tuple(self._cameras("colour")),
-                "thermal": dict.fromkeys(self._cameras("thermal"), self._thermal_encoding),
-                "labels": dict.fromkeys(self._cameras("labels"), label_table),
-            }
-        )
+        header = self._header_of(self._recorded, self._label_table)
         partial = self.folder / f"{HEADER_FILE}.partial"
         with partial.open("wb") as head:
             head.write(header.to_json())
@@ -212,17 +209,37 @@ class RecordingWriter:
         labels = {f"{camera_name}.labels": numbers for camera_name, numbers in scan.labels.items()}
         for folder, numbers in labels.items():
             write_labels(self.folder / "images" / folder / name, numbers)
-        self._label_table = dict(scan.label_names) if scan.labels else self._label_table
-        self._recorded |= dict.fromkeys(("labels", labelled) for labelled in scan.labels)
-        self._recorded["range", scan.range_camera] = None
-        if scan.amplitude is not None:
-            self._recorded["amplitude", scan.range_camera] = None
-        self._recorded |= dict.fromkeys(("colour", folder) for folder in scan.colour)
-        self._recorded |= dict.fromkeys(("thermal", folder) for folder in scan.thermal)
         return {f"{folder}.txt": f"images/{folder}/{name}" for folder in [*counts, *scan.colour, *labels]}
 
-    def _cameras(self, kind: str) -> list[str]:
-        return [camera for recorded, camera in self._recorded if recorded == kind]
+    def _header_of(self, recorded: Iterable[tuple[str, str]], label_table: LabelNames) -> RecordingHeader:
+        """Header of a recording of these images: (list in the header, camera)."""
+        cameras: dict[str, list[str]] = {}
+        for kind, camera in recorded:
+            cameras.setdefault(kind, []).append(camera)
+        names = {str(number): name for number, name in label_table.items()}
+        return self._header.model_copy(
+            update={
+                "range": dict.fromkeys(cameras.get("range", ()), self._range_encoding),
+                "amplitude": tuple(cameras.get("amplitude", ())),
+                "colour": tuple(cameras.get("colour", ())),
+                "thermal": dict.fromkeys(cameras.get("thermal", ()), self._thermal_encoding),
+                "labels": dict.fromkeys(cameras.get("labels", ()), names),
+            }
+        )
+
+    def _check_header(self, recorded: Iterable[tuple[str, str]], label_table: LabelNames) -> None:
+        """Refuse images with which the recording's header would be larger than readers take.
+
+        Raises:
+            BadInputError: kind `bad_labels`: the table of labels, once for each camera, is too large.
+        """
+        size_bytes = len(self._header_of(recorded, label_table).to_json())
+        if size_bytes > HEADER_BYTES_MAX:
+            raise BadInputError(
+                "bad_labels",
+                f"with this table of {len(label_table)} labels for each camera {HEADER_FILE} has {size_bytes} bytes, "
+                f"and may have {HEADER_BYTES_MAX}; leave out the numbers that no image holds",
+            )
 
     def _list(self, name: str) -> TextIO:
         if name not in self._lists:
@@ -232,3 +249,12 @@ class RecordingWriter:
             file.write(LIST_COMMENTS.get(name, "# time path\n"))
             self._lists[name] = file
         return self._lists[name]
+
+
+def _images_of(scan: Scan) -> Iterator[tuple[str, str]]:
+    """(list in the header, camera) of each image of a scan."""
+    yield "range", scan.range_camera
+    if scan.amplitude is not None:
+        yield "amplitude", scan.range_camera
+    for kind, images in (("labels", scan.labels), ("colour", scan.colour), ("thermal", scan.thermal)):
+        yield from ((kind, camera) for camera in images)

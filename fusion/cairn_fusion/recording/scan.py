@@ -22,6 +22,7 @@ from cairn_calib.rig.poses import Transform, check_transform
 from cairn_calib.rig.rig import Rig, Spectrum
 from cairn_fusion.recording.scan_units import check_ranges, check_temperatures, check_time
 from cairn_map.errors import BadInputError
+from cairn_map.evidence.channels import CLASS_NAME
 
 Image = npt.NDArray[np.generic]
 LabelNames = Mapping[int, str | None]
@@ -110,9 +111,18 @@ def _check_image(rig: Rig, name: str, image: Image, spectrum: Spectrum, dtype: t
 
 
 def _check_labels(scan: Scan, rig: Rig) -> None:
-    """Refuse label images that are not their camera's in size or type, or hold numbers that the table lacks."""
-    if any(not 0 <= number <= LABEL_MAX for number in scan.label_names):
-        raise BadInputError("bad_labels", f"a table of labels has numbers from 0 to {LABEL_MAX}")
+    """Refuse a table with numbers or names that none may have, and label images that do not fit it or their camera."""
+    for number, name in scan.label_names.items():
+        if isinstance(number, bool) or not isinstance(number, int | np.integer) or not 0 <= number <= LABEL_MAX:
+            raise BadInputError(
+                "bad_labels", f"a table of labels has numbers from 0 to {LABEL_MAX}, got {number!r:.80}"
+            )
+        if name is not None and not (isinstance(name, str) and CLASS_NAME.fullmatch(name)):
+            raise BadInputError(
+                "bad_labels",
+                "the name of a label is 1 to 32 of a-z, 0-9 and _ and begins with a letter, or is None for one that "
+                f"says nothing; got {name!r:.80} for {number}",
+            )
     for name, image in scan.labels.items():
         if image.dtype not in (np.uint8, np.uint16) or image.ndim != 2:
             raise BadInputError(

@@ -71,7 +71,7 @@ def decode_scan(data: bytes) -> Scan:
             colour=_of_kind(arrays, "colour"),
             thermal=_of_kind(arrays, "thermal"),
             labels=_of_kind(arrays, "labels"),
-            label_names={int(number): name for number, name in head.get("label_names", ())},
+            label_names={int(number): _label_name(name) for number, name in head.get("label_names", ())},
             scalars=head["scalars"],
             T_map_body=arrays.get(("pose", "body")),
         )
@@ -146,6 +146,17 @@ def _arrays(scan: Scan) -> dict[tuple[str, str], Array]:
     arrays |= {("thermal", name): image for name, image in scan.thermal.items()}
     arrays |= {("labels", name): image for name, image in scan.labels.items()}
     return arrays
+
+
+def _label_name(name: object) -> str | None:
+    """Class of a label; None says nothing.
+
+    Raises:
+        ValueError: it is no text.
+    """
+    if name is None or isinstance(name, str):
+        return name
+    raise ValueError(f"the name of a label is a text or null, got {name!r:.80}")
 
 
 def _of_kind(arrays: Mapping[tuple[str, str], Array], kind: str) -> dict[str, Array]:

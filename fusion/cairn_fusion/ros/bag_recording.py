@@ -166,9 +166,9 @@ def open_bag_recording(
 def image_topics(mapping: BagMapping) -> Iterator[tuple[str, str, tuple[str, ...]]]:
     """Topics of pixels and points, each with its camera and the types that it may have."""
     for name, camera in mapping.cameras.items():
-        yield camera.topic, name, tuple(sorted(CLOUDS)) if camera.lidar else (IMAGE, COMPRESSED)
-        if camera.amplitude is not None:
-            yield camera.amplitude, name, (IMAGE, COMPRESSED)
+        yield camera.first_topic, name, tuple(sorted(CLOUDS)) if camera.lidar else (IMAGE, COMPRESSED)
+        for topic in camera.image_topics[1:]:
+            yield topic, name, (IMAGE, COMPRESSED)
 
 
 def images_of(index: BagIndex, topic: str, camera: str, types: tuple[str, ...]) -> TopicIndex:
@@ -199,7 +199,7 @@ def rig_of(index: BagIndex, mapping: BagMapping, topics: Mapping[str, TopicIndex
         if camera.T_base_camera is not None:
             T_base_camera = np.array(camera.T_base_camera)
         else:
-            frame = camera.frame or topics[camera.topic].frame
+            frame = camera.frame or topics[camera.first_topic].frame
             T_base_camera = index.tree.fixed_pose(mapping.frames.base, frame)
         # A lidar's frame has ROS's axes, not a camera's.
         if camera.lidar is not None:

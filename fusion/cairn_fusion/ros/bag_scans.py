@@ -67,7 +67,7 @@ def scans_of(
     for name, camera in mapping.cameras.items():
         if camera.spectrum is not Spectrum.RANGE:
             continue
-        times_s = lists[camera.topic].times_s
+        times_s = lists[camera.first_topic].times_s
         has_pose = (times_s >= first_s) & (times_s <= last_s)
         if not has_pose.all():
             log.warning(
@@ -75,7 +75,7 @@ def scans_of(
                 bag.path.name,
                 int((~has_pose).sum()),
                 len(times_s),
-                camera.topic,
+                camera.first_topic,
             )
         for time_s in times_s[has_pose].tolist():
             images = images_near(mapping, camera, lists, time_s)
@@ -98,11 +98,11 @@ def _scans_with_poses(
         (time_s, name, camera)
         for name, camera in mapping.cameras.items()
         if camera.spectrum is Spectrum.RANGE
-        for time_s in lists[camera.topic].times_s.tolist()
+        for time_s in lists[camera.first_topic].times_s.tolist()
     ]
     found.sort(key=lambda entry: entry[0])
     keys = [
-        FrameKey(label=f"the image of {camera.topic} at {time_s:.6f} s in {bag.path}", number=n, time_s=time_s)
+        FrameKey(label=f"the image of {camera.first_topic} at {time_s:.6f} s in {bag.path}", number=n, time_s=time_s)
         for n, (time_s, _, camera) in enumerate(found)
     ]
     return tuple(
@@ -116,15 +116,17 @@ def others_of(mapping: BagMapping, camera: MappedCamera) -> list[str]:
     """Topics of the images that go with those of a range camera; none with points that have no raster."""
     if camera.is_loose:
         return []
-    others = [other.topic for other in mapping.cameras.values() if other.spectrum is not Spectrum.RANGE]
-    return [*others, *([camera.amplitude] if camera.amplitude else [])]
+    cameras = mapping.cameras.values()
+    others = [other.topic for other in cameras if other.spectrum is not Spectrum.RANGE]
+    found = [*others, camera.amplitude, *(other.labels for other in cameras)]
+    return [topic for topic in found if topic is not None]
 
 
 def images_near(
     mapping: BagMapping, camera: MappedCamera, lists: Mapping[str, TimedList[int]], time_s: float
 ) -> dict[str, int]:
     """The images of one scan: the range image itself, and the nearest of every other topic, earlier one of a tie."""
-    images = {camera.topic: lists[camera.topic].nearest(time_s, max_gap_s=0.0)}
+    images = {camera.first_topic: lists[camera.first_topic].nearest(time_s, max_gap_s=0.0)}
     for topic in others_of(mapping, camera):
         images[topic] = lists[topic].nearest(time_s, max_gap_s=mapping.time_tolerance_s)
     return {topic: n for topic, n in images.items() if n is not None}

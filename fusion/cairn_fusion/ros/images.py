@@ -4,6 +4,7 @@
     amplitude    16UC1 mono16 8UC1 mono8
     thermal      16UC1 mono16
     colour       rgb8 bgr8 rgba8 bgra8 8UC3 mono8, JPEG, PNG
+    labels       8UC1 mono8 16UC1 mono16 32SC1, PNG
 
 Names of encodings are those of sensor_msgs/image_encodings.hpp. For compressed images the file's own header counts, and
 is checked before a pixel is allocated (`recording.images`).
@@ -15,7 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_calib.rig.raster import MAX_SIDE_PX
-from cairn_fusion.recording.images import PNG_SIGNATURE, colour_of_bytes, grey16_of_bytes
+from cairn_fusion.recording.images import PNG_SIGNATURE, colour_of_bytes, grey16_of_bytes, labels_of_bytes
+from cairn_fusion.recording.scan import LABEL_MAX
 from cairn_fusion.ros.messages import RosCompressedImage, RosImage
 from cairn_map.errors import BadInputError, DamagedDataError
 
@@ -26,6 +28,7 @@ RAW = {
     "16UC1": ("u2", 1),
     "mono16": ("u2", 1),
     "32FC1": ("f4", 1),
+    "32SC1": ("i4", 1),
     "8UC1": ("u1", 1),
     "mono8": ("u1", 1),
     "rgb8": ("u1", 3),
@@ -38,6 +41,7 @@ RAW = {
 DEPTHS = ("16UC1", "mono16", "32FC1")
 AMPLITUDES = ("16UC1", "mono16", "8UC1", "mono8")
 THERMALS = ("16UC1", "mono16")
+LABELS = ("8UC1", "mono8", "16UC1", "mono16", "32SC1")
 COLOURS = ("rgb8", "bgr8", "8UC3", "rgba8", "bgra8", "mono8")
 BLUE_FIRST = frozenset(["bgr8", "bgra8", "8UC3"])
 DEPTH_HEAD = struct.Struct("<iff")
@@ -90,6 +94,23 @@ def thermal_counts_of(image: AnyImage, name: str) -> npt.NDArray[np.uint16]:
     if isinstance(image, RosImage):
         return _raw(image, THERMALS, name).astype(np.uint16)
     return grey16_of_bytes(bytes(image.data), name)
+
+
+def labels_of(image: AnyImage, name: str) -> npt.NDArray[np.uint8 | np.uint16]:
+    """(H, W) uint8 or uint16 numbers of labels. Errors as `depth_of`.
+
+    Raises:
+        BadInputError: also kind `unknown_label`: one of 32 bits is below 0 or above 65535.
+    """
+    if not isinstance(image, RosImage):
+        return labels_of_bytes(bytes(image.data), name)
+    numbers = _raw(image, LABELS, name)
+    if numbers.dtype == np.uint8:
+        return numbers.astype(np.uint8, copy=False)
+    strange = numbers[(numbers < 0) | (numbers > LABEL_MAX)]
+    if len(strange):
+        raise BadInputError("unknown_label", f"{name} holds {strange[0]}; labels are numbers from 0 to {LABEL_MAX}")
+    return numbers.astype(np.uint16)
 
 
 def colour_of(image: AnyImage, name: str) -> npt.NDArray[np.uint8]:

@@ -189,9 +189,8 @@ class LiveScans:
         self._max_wait_s = max_wait_s
         self._image_bytes_max = image_bytes_max
         self._track = LiveFrames(f"{source}: {mapping.poses.topic}")
-        self._ranges = {c.topic: name for name, c in mapping.cameras.items() if c.spectrum is Spectrum.RANGE}
-        amplitudes = {c.amplitude for c in mapping.cameras.values() if c.amplitude is not None}
-        self._images = {topic: _Images() for topic in {c.topic for c in mapping.cameras.values()} | amplitudes}
+        self._ranges = {c.first_topic: name for name, c in mapping.cameras.items() if c.spectrum is Spectrum.RANGE}
+        self._images = {topic: _Images() for camera in mapping.cameras.values() for topic in camera.image_topics}
         self._pending: list[_Pending] = []
         self._seen: dict[str, deque[float]] = {topic: deque(maxlen=SEEN_MAX) for topic in self._ranges}
 
@@ -387,11 +386,13 @@ class LiveScans:
 
     def _scan(self, pending: _Pending, camera: MappedCamera, way: _Way) -> ReadyScan:
         pose_at, first_s, last_s = way.pose_at, way.first_s, way.last_s
-        lists = {topic: self._images[topic].timed() for topic in (camera.topic, *others_of(self._mapping, camera))}
+        lists = {
+            topic: self._images[topic].timed() for topic in (camera.first_topic, *others_of(self._mapping, camera))
+        }
         numbers = images_near(self._mapping, camera, lists, pending.time_s)
         self.alone += len(numbers) < len(lists)
         messages = {topic: self._images[topic].messages[n] for topic, n in numbers.items()}
-        self._images[camera.topic].forget(pending.time_s)
+        self._images[camera.first_topic].forget(pending.time_s)
         found = BagScan(time_s=pending.time_s, T_map_rig=pose_at(pending.time_s), camera=pending.camera, images=numbers)
         return ReadyScan(
             found,
@@ -405,5 +406,5 @@ class LiveScans:
     def _leave_out(self, pending: _Pending, cause: Cause) -> None:
         """Drop a range image that waits, and count it."""
         self._pending.remove(pending)
-        self._images[self._mapping.cameras[pending.camera].topic].forget(pending.time_s)
+        self._images[self._mapping.cameras[pending.camera].first_topic].forget(pending.time_s)
         self.left_out[cause] += 1

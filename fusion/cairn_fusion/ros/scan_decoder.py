@@ -5,7 +5,7 @@
 The same bytes give the same scan, bit for bit, whatever door they came through.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import TypeVar
 
 import numpy as np
@@ -28,7 +28,7 @@ from cairn_fusion.recording.scan import Scan, check_scan
 from cairn_fusion.ros.bag import BagMessage, Topic, Wire
 from cairn_fusion.ros.bag_index import translate_message_damage, wire_of
 from cairn_fusion.ros.bag_scans import BagScan, PoseAt
-from cairn_fusion.ros.images import AnyImage, Pixels, amplitude_of, colour_of, depth_of, thermal_counts_of
+from cairn_fusion.ros.images import AnyImage, Pixels, amplitude_of, colour_of, depth_of, labels_of, thermal_counts_of
 from cairn_fusion.ros.messages import IMAGE, read_compressed_image, read_image
 from cairn_fusion.ros.point_clouds import check_beams, read_cloud
 from cairn_fusion.ros.topic_mapping import BagMapping, MappedCamera
@@ -67,6 +67,11 @@ class ScanDecoder:
         cameras = self._mapping.cameras
         own = cameras[found.camera]
         xyz = None if own.lidar is None else self._sweep(own, found, message, pose_at)
+        labels = {
+            name: self._pixels(camera.labels, message, labels_of)
+            for name, camera in cameras.items()
+            if camera.labels is not None and camera.labels in found.images
+        }
         scan = Scan(
             time_s=found.time_s,
             T_map_rig=found.T_map_rig,
@@ -75,35 +80,40 @@ class ScanDecoder:
             points_m=None if xyz is None or not own.is_loose else (xyz @ R_LIDAR_CAMERA).astype(np.float32),
             amplitude=self._amplitude(own, found, message),
             colour={
-                name: self._pixels(camera.topic, message, colour_of)
-                for name, camera in cameras.items()
-                if camera.spectrum is Spectrum.COLOUR and camera.topic in found.images
+                name: self._pixels(topic, message, colour_of) for name, topic in self._others(Spectrum.COLOUR, found)
             },
             thermal={
-                name: decode_kelvin(self._pixels(camera.topic, message, thermal_counts_of), camera.thermal_encoding)
-                for name, camera in cameras.items()
-                if camera.spectrum is Spectrum.THERMAL and camera.topic in found.images
+                name: decode_kelvin(self._pixels(topic, message, thermal_counts_of), cameras[name].thermal_encoding)
+                for name, topic in self._others(Spectrum.THERMAL, found)
             },
+            labels=labels,
+            label_names=self._mapping.label_names if labels else {},
         )
         check_scan(scan, self._rig)
         return scan
 
+    def _others(self, spectrum: Spectrum, found: BagScan) -> Iterator[tuple[str, str]]:
+        """Cameras of a spectrum of which a scan has an image, each with its topic."""
+        for name, camera in self._mapping.cameras.items():
+            if camera.spectrum is spectrum and camera.topic is not None and camera.topic in found.images:
+                yield name, camera.topic
+
     def _range(self, camera: MappedCamera, found: BagScan, message: MessageOf) -> npt.NDArray[np.float32]:
         """(H, W) metres along the beam."""
-        return _range_of(self._pixels(camera.topic, message, depth_of), self._rig[found.camera].camera, camera)
+        return _range_of(self._pixels(camera.first_topic, message, depth_of), self._rig[found.camera].camera, camera)
 
     def _sweep(
         self, camera: MappedCamera, found: BagScan, message: MessageOf, pose_at: PoseAt | None
     ) -> npt.NDArray[np.float64]:
         """(N, 3) the points of a lidar's cloud, metres, its own frame; of a known lidar they must lie on its beams."""
-        sweep, topic = message(camera.topic), self._topics[camera.topic]
+        sweep, topic = message(camera.first_topic), self._topics[camera.first_topic]
         with translate_message_damage(self._source, sweep):
             points = read_cloud(sweep.data, wire_of(topic), type_name=topic.type)
             xyz = points.xyz()
         if not camera.is_loose:
             check_beams(xyz, self._lidar(found.camera), found.camera)
             return xyz
-        place = f"{self._source}: {camera.topic} at {found.time_s:.6f} s"
+        place = f"{self._source}: {camera.first_topic} at {found.time_s:.6f} s"
         cloud = cloud_of({name: points.column(name) for name in points.fields}, place)
         times = None if self._is_deskewed or pose_at is None else point_times(cloud, place)
         if times is None or pose_at is None:

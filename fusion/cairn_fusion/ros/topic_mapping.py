@@ -7,15 +7,17 @@ time_tolerance_s: 0.02
 scans_per_measurement: 30
 cameras:
   depth: {spectrum: range, topic: /camera/depth/image_raw, info: /camera/depth/camera_info, units_per_m: 1000}
-  colour: {spectrum: colour, topic: /camera/color/image_raw, info: /camera/color/camera_info}
+  colour: {spectrum: colour, topic: /camera/color/image_raw, info: /camera/color/camera_info, labels: /segmentation}
+label_names: {0: null, 7: wall, 11: chair}
 """
 
+import re
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from cairn_calib.exchange.yaml_text import document_of_yaml
 from cairn_calib.rig.brown import Coefficients
@@ -33,9 +35,11 @@ from cairn_fusion.recording.recording_format import (
     ThermalEncoding,
     check_camera_name,
 )
+from cairn_fusion.recording.scan import LABEL_MAX
 from cairn_fusion.recording.timed_lists import read_text
 from cairn_fusion.ros.messages import RosCameraInfo
 from cairn_map.errors import BadInputError, first_error
+from cairn_map.evidence.channels import ClassName
 
 MAPPING_BYTES_MAX = 1 << 20
 TOPICS_FILE = "topics.yaml"
@@ -46,6 +50,29 @@ PLUMB_BOB = ("plumb_bob", "")
 Topic = Annotated[str, Field(pattern=r"^\S{1,1024}$")]
 Frame = Annotated[str, Field(pattern=r"^[^/\s]\S{0,254}$")]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
+LABEL_NUMBER = re.compile(r"0|[1-9][0-9]{0,4}")
+
+
+def numbered(table: object) -> object:
+    """A table of labels with whole numbers for keys, which JSON has as texts alone.
+
+    Raises:
+        ValueError: a key is no number of a label, or one stands twice.
+    """
+    if not isinstance(table, dict):
+        return table
+    found: dict[int, object] = {}
+    for key, name in table.items():
+        text = str(key)
+        if isinstance(key, bool) or not LABEL_NUMBER.fullmatch(text) or int(text) > LABEL_MAX:
+            raise ValueError(f"numbers of labels are whole ones from 0 to {LABEL_MAX}, got {text[:80]!r}")
+        if int(text) in found:
+            raise ValueError(f"label {text} stands twice")
+        found[int(text)] = name
+    return found
+
+
+LabelTable = Annotated[dict[int, ClassName | None], BeforeValidator(numbered)]
 
 
 class Model(BaseModel):
@@ -132,9 +159,12 @@ class MappedCamera(Model):
     """One camera: its topics, its pose, and the coding of its pixels."""
 
     spectrum: Spectrum
-    topic: Topic
+    topic: Topic | None = None
+    """Topic of its pixels or points; None: of this camera label images alone are mapped."""
     amplitude: Topic | None = None
     """Topic of a range camera's images of its own light, same raster."""
+    labels: Topic | None = None
+    """Topic of label images in the camera's raster: numbers of `label_names`, with the stamp of the labelled image."""
     info: Topic | None = None
     """Topic of CameraInfo, of which the first message counts."""
     intrinsics: Intrinsics | None = None
@@ -154,6 +184,16 @@ class MappedCamera(Model):
     kelvin_at_zero: Finite = 0.0
 
     @property
+    def image_topics(self) -> tuple[str, ...]:
+        """Topics of its pixels or points, the one that names its frame first."""
+        return tuple(topic for topic in (self.topic, self.amplitude, self.labels) if topic is not None)
+
+    @property
+    def first_topic(self) -> str:
+        """Topic of its pixels or points; without one that of its label images."""
+        return self.image_topics[0]
+
+    @property
     def is_loose(self) -> bool:
         """True if the topic's points have no raster."""
         return self.lidar is not None and self.lidar.kind is LidarKind.CLOUD
@@ -170,10 +210,12 @@ class MappedCamera(Model):
 
     @model_validator(mode="after")
     def _is_whole(self) -> Self:
+        if self.topic is None and (self.labels is None or self.spectrum is Spectrum.RANGE):
+            raise ValueError("give the topic of its images; only a camera of labels, and of no ranges, can be without")
         if sum(given is not None for given in (self.info, self.intrinsics, self.lidar)) != 1:
             raise ValueError("give either info, a CameraInfo topic, or intrinsics; or lidar, of point clouds")
-        if self.lidar is not None and (self.spectrum is not Spectrum.RANGE or self.amplitude is not None):
-            raise ValueError("a lidar's spectrum is range, and it has no amplitude")
+        if self.lidar is not None and (self.spectrum is not Spectrum.RANGE or len(self.image_topics) > 1):
+            raise ValueError("a lidar's spectrum is range, and it has neither amplitude nor labels")
         if self.amplitude is not None and self.spectrum is not Spectrum.RANGE:
             raise ValueError("amplitude is of range cameras")
         return self
@@ -190,6 +232,8 @@ class BagMapping(Model):
     """Largest time between the range image and another image, seconds."""
     scans_per_measurement: Annotated[int, Field(ge=1, le=4096)] = 1
     cameras: Annotated[dict[str, MappedCamera], Field(min_length=1, max_length=32)]
+    label_names: LabelTable = {}
+    """Class of each number that label images hold; null: such a pixel says nothing."""
 
     @model_validator(mode="after")
     def _has_ranges(self) -> Self:
@@ -200,6 +244,13 @@ class BagMapping(Model):
                 raise ValueError(exc.message) from exc
         if all(camera.spectrum is not Spectrum.RANGE for camera in self.cameras.values()):
             raise ValueError("one camera at least must have the spectrum range")
+        labelled = [name for name, camera in self.cameras.items() if camera.labels is not None]
+        if labelled and not self.label_names:
+            raise ValueError(
+                f"camera {labelled[0]} has labels: name their numbers, `label_names: {{0: null, 7: wall}}`"
+            )
+        if self.label_names and not labelled:
+            raise ValueError("label_names is given, and no camera has a topic of labels")
         return self
 
     def topics(self) -> dict[str, str]:
@@ -208,7 +259,12 @@ class BagMapping(Model):
         for name, camera in self.cameras.items():
             wanted |= {
                 topic: f"{what} of camera {name}"
-                for topic, what in ((camera.topic, "images"), (camera.amplitude, "amplitude"), (camera.info, "info"))
+                for topic, what in (
+                    (camera.topic, "images"),
+                    (camera.amplitude, "amplitude"),
+                    (camera.labels, "labels"),
+                    (camera.info, "info"),
+                )
                 if topic is not None
             }
         return wanted

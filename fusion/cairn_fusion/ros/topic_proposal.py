@@ -2,6 +2,7 @@
 
     depth      16 bits or float, "depth" in its name          thermal    16 bits, a thermal camera's name
     amplitude  grey, "infra", "ir" or "amplitude" in its name  colour     every other picture
+    labels     grey, "label" or "segmentation" in its name: a comment, for no message names the numbers
     poses      tf, if a moving edge lies above the range camera; else the one odometry or pose topic
 
 A fact that only the maker of the bag knows becomes a question, and `replay` without a file refuses the bag.
@@ -17,14 +18,15 @@ import numpy as np
 
 from cairn_calib.rig.rig import Spectrum
 from cairn_fusion.ros.bag_index import BASE, BagIndex, TopicIndex
-from cairn_fusion.ros.images import COLOURS
+from cairn_fusion.ros.images import COLOURS, LABELS
 from cairn_fusion.ros.messages import CAMERA_INFO, CLOUDS, COMPRESSED, IMAGE, TRANSFORMS
 from cairn_fusion.ros.tf_tree import FrameTree
 from cairn_fusion.ros.topic_mapping import DECIDE
 
 AMPLITUDE_WORDS = re.compile(r"infra|amplitude|intensity|(^|[_/])(ir|nir)\d*([_/]|$)")
 THERMAL_WORDS = re.compile(r"therm|lwir|flir|boson|lepton|tau2|optris|seek")
-IGNORED_WORDS = re.compile(r"confidence|theora|ffmpeg|aligned_.*_mask|segmentation|label")
+IGNORED_WORDS = re.compile(r"confidence|theora|ffmpeg|aligned_.*_mask")
+LABEL_WORDS = re.compile(r"segmentation|label")
 CAMERA_WORDS = re.compile(r"depth|camera|stereo|rgb|color")
 """Words in the names of clouds that a depth camera's driver makes from its images."""
 WORLD_FRAMES = ("odom", "map", "world", "earth")
@@ -75,6 +77,7 @@ class Guess:
     entry: TopicIndex
     info: str | None
     amplitude: str | None = None
+    labels: str | None = None
 
     @property
     def is_rectified(self) -> bool:
@@ -115,6 +118,10 @@ def propose(index: BagIndex, path: Path, *, command: str | None = None) -> Propo
     ]
     for camera in cameras:
         lines += _camera_lines(camera, index)
+    if any(camera.labels for camera in cameras):
+        lines.append(
+            "# label_names: {0: null, 1: wall, 2: floor}  # class of each number of labels; null: says nothing"
+        )
     return Proposal("\n".join(lines) + "\n", tuple(questions))
 
 
@@ -139,14 +146,15 @@ def _cameras(index: BagIndex, questions: list[str]) -> list[Guess]:
     images = [e for e in images if e.topic.type == IMAGE or e.topic.name.rsplit("/", 1)[0] not in plain]
     roles = {entry.topic.name: _role(entry) for entry in images}
     amplitudes = [entry for entry in images if roles[entry.topic.name] == "amplitude"]
+    labels = [entry for entry in images if roles[entry.topic.name] == "labels"]
     guesses: list[Guess] = []
     for spectrum in Spectrum:
         found = [entry for entry in images if roles[entry.topic.name] == spectrum.value]
         for entry in _one_of_each_place(found):
             name = _unique("depth" if spectrum is Spectrum.RANGE else spectrum.value, {g.name for g in guesses})
             info = _info_of(entry, index)
-            amplitude = _amplitude_of(entry, amplitudes) if spectrum is Spectrum.RANGE else None
-            guesses.append(Guess(name, spectrum, entry, info, amplitude))
+            amplitude = _same_raster(entry, amplitudes) if spectrum is Spectrum.RANGE else None
+            guesses.append(Guess(name, spectrum, entry, info, amplitude, _same_raster(entry, labels)))
             if info is None:
                 questions.append(f"camera {name}: no CameraInfo next to {entry.topic.name}; write its intrinsics")
     # Depth cameras first, so that the first range camera is one of them if there is any.
@@ -173,6 +181,8 @@ def _lidars(index: BagIndex) -> list[Guess]:
 def _role(entry: TopicIndex) -> str:
     """Role of a topic's pictures, by their encoding and name."""
     word, encoding = _word(entry), entry.encoding
+    if LABEL_WORDS.search(word):
+        return "labels" if encoding in LABELS else "none"
     is_deep = encoding.startswith(("16UC1", "mono16", "32FC1")) or "compressedDepth" in encoding
     if is_deep and ("depth" in word or encoding.startswith("32FC1") or "compressedDepth" in encoding):
         return Spectrum.RANGE
@@ -208,8 +218,8 @@ def _info_of(entry: TopicIndex, index: BagIndex) -> str | None:
     return found[0].topic.name if len(found) == 1 else None
 
 
-def _amplitude_of(camera: TopicIndex, candidates: Iterable[TopicIndex]) -> str | None:
-    """Topic of the range camera's own light: the only one with the same frame and raster, or None."""
+def _same_raster(camera: TopicIndex, candidates: Iterable[TopicIndex]) -> str | None:
+    """Topic of other images of a camera: the only one with the same frame and raster, or None."""
     mine = (camera.frame, camera.image_size)
     found = [entry for entry in candidates if (entry.frame, entry.image_size) == mine]
     return found[0].topic.name if len(found) == 1 else None
@@ -286,6 +296,8 @@ def _camera_lines(camera: Guess, index: BagIndex) -> Iterator[str]:
         yield "    convention: z  # along the optical axis; `range`: along each beam, as time of flight measures"
         if camera.amplitude:
             yield f"    amplitude: {_quoted(camera.amplitude)}  # of the range camera's own light, same raster"
+    if camera.labels:
+        yield f"    # labels: {_quoted(camera.labels)}  # for a layer of classes; give label_names below, too"
     if camera.spectrum is Spectrum.THERMAL:
         yield "    kelvin_per_count: 0.01  # kelvin = counts * kelvin_per_count + kelvin_at_zero"
         yield "    kelvin_at_zero: 0"

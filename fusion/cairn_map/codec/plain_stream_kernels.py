@@ -3,7 +3,8 @@
     first pass    presence bits and words of all channels, and how many bytes each column needs
     second pass   all streams, each at its place in the canonical bytes
 
-    spec   (channels, 2) planes of each channel, and how many are sums of squares (`channels.planes_and_squares`)
+    spec   (channels, 3) planes of each channel, how many are sums of squares, 1 if they are votes for classes
+           (`channels.planes_and_squares`)
 
 Streams are in the order of FORMAT.md section 6. The words of a channel stand in the order of its streams: weight first.
 """

@@ -14,6 +14,7 @@ plane: its votes are the weight less those of the others.
 """
 
 import colorsys
+import re
 from enum import StrEnum
 from functools import lru_cache
 from typing import Annotated, Self
@@ -71,7 +72,9 @@ SHADES = (0.95, 0.75, 0.55)
 """Brightness of three classes in turn, 0 to 1."""
 OTHER_GREY = 150
 """Red, green and blue of `other`, and of no class that has a hue."""
-ClassName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,31}$")]
+CLASS_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
+"""All of a class's name."""
+ClassName = Annotated[str, Field(pattern=f"^{CLASS_NAME.pattern}$")]
 
 
 class Channel(BaseModel, frozen=True):

@@ -133,6 +133,11 @@ class Geometry(BaseModel, frozen=True, extra="forbid"):
         return self.voxel_height_um / 1e6
 
     @property
+    def voxel_edges_m(self) -> tuple[float, float, float]:
+        """Edges of a voxel along x, y and z, metres; equal but where voxels are flat."""
+        return self.voxel_edge_m, self.voxel_edge_m, self.voxel_height_m
+
+    @property
     def side(self) -> int:
         """Voxels along a cell's edge."""
         return 1 << self.depth

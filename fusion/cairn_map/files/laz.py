@@ -1,7 +1,8 @@
 """LAZ files of points: LAS 1.4 (ASPRS), compressed by LASzip, made part by part with the memory of one chunk.
 
-Coordinates are whole numbers of half a node's edge, so they are exact. Point format 7: colours have 16 bits (8-bit sRGB
-times 256). Values for which LAS has no field are its extra bytes, each a float with its unit in the description:
+Coordinates are whole numbers of half a node's edge, of each axis its own, so they are exact. Point format 7: colours
+have 16 bits (8-bit sRGB times 256). Values for which LAS has no field are its extra bytes, each a float with its unit
+in the description:
 
     probability        0 to 1
     temperature        kelvin, mean below the node; NaN where no thermal camera looked
@@ -52,7 +53,8 @@ class LazHead:
     low_m: Floats
     """(3,) lowest and highest centre, metres, map frame; zeros without points."""
     high_m: Floats
-    node_edge_m: float
+    node_edges_m: tuple[float, float, float]
+    """Edges of a node along x, y and z, metres; of a level layer the last one is its height."""
     frame: str
     """Name of the coordinate system."""
     times: tuple[str, ...] = ()
@@ -79,7 +81,7 @@ def laz_parts(head: LazHead, tables: Iterable[Table]) -> Iterator[bytes]:
 
 def _header(head: LazHead) -> Any:
     header = laspy.LasHeader(version="1.4", point_format=POINT_FORMAT)
-    header.scales, header.offsets = np.full(3, head.node_edge_m / 2), np.zeros(3)
+    header.scales, header.offsets = np.array(head.node_edges_m) / 2, np.zeros(3)
     header.add_extra_dims([laspy.ExtraBytesParams(name, np.dtype("<f4"), description=EXTRA[name]) for name in EXTRA])
     header.add_extra_dims([laspy.ExtraBytesParams(name, np.dtype("<f8"), description=TIME) for name in head.times])
     header.add_extra_dims([laspy.ExtraBytesParams(name, np.dtype("<f4"), description=name) for name in head.numbers])
@@ -95,9 +97,9 @@ def _header(head: LazHead) -> Any:
 
 def _rows(table: Table, dtype: np.dtype[np.void], head: LazHead) -> Table:
     rows = np.zeros(len(table), dtype)
-    for name in "xyz":
+    for name, edge_m in zip("xyz", head.node_edges_m, strict=True):
         # Centres are odd numbers of half an edge: so single precision, which tables have, is enough.
-        rows[name.upper()] = 2 * np.floor(table[name].astype(np.float64) / head.node_edge_m).astype(np.int32) + 1
+        rows[name.upper()] = 2 * np.floor(table[name].astype(np.float64) / edge_m).astype(np.int32) + 1
     for name in ("red", "green", "blue"):
         rows[name] = table[name].astype(np.uint16) * COLOUR_STEP
     for name in (*EXTRA, *head.times, *head.numbers):

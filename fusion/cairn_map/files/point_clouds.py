@@ -77,7 +77,8 @@ class About:
     """Source of a file's points, as its comment states it."""
 
     map_name: str
-    node_edge_m: float
+    node_edges_m: tuple[float, float, float]
+    """Edges of a node along x, y and z, metres; of a level layer the last one is its height."""
     has_times: bool = False
     """True of a map with epochs: the points have `TIMES`."""
     classes: tuple[str, ...] = ()
@@ -85,7 +86,9 @@ class About:
 
     def __str__(self) -> str:
         times = "; UTC seconds since 1970" if self.has_times else ""
-        return f"map {self.map_name}, nodes of {self.node_edge_m:g} m; metres, map frame; kelvin{times}"
+        edge_m, _, height_m = self.node_edges_m
+        height = f" and {height_m:g} m height" if height_m != edge_m else ""
+        return f"map {self.map_name}, nodes of {edge_m:g} m{height}; metres, map frame; kelvin{times}"
 
     @property
     def point(self) -> np.dtype[np.void]:
@@ -160,7 +163,7 @@ def point_file(form: str, found: PointBounds, tables: Iterable[Table], about: Ab
 
         low_m, high_m = (found.low_m, found.high_m) if found.count else (np.zeros(3), np.zeros(3))
         times, numbers = tuple(TIMES) if about.has_times else (), CLASS_FIELDS if about.classes else ()
-        head = LazHead(found.count, low_m, high_m, about.node_edge_m, f"map {about.map_name}", times, numbers)
+        head = LazHead(found.count, low_m, high_m, about.node_edges_m, f"map {about.map_name}", times, numbers)
         return laz_parts(head, tables)
     return _plain_parts(form, found.count, tables, about)
 

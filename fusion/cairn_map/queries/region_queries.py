@@ -11,11 +11,12 @@ from cairn_map.arrays import Floats, Ints
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.evidence import Evidence, empty_evidence
-from cairn_map.evidence.grid import Cell, CellKey, centres_of_voxels, voxels_in_cell
+from cairn_map.evidence.grid import Cell, CellKey, centres_of_voxels, check_cubes, voxels_in_cell
 from cairn_map.evidence.voxels import Voxels, joined_voxels, voxels_of_evidence
 from cairn_map.queries import layer_kernels, point_queries
 from cairn_map.queries import layer_kernels as kernels
 from cairn_map.queries.frozen_map import Box, FrozenMap
+from cairn_map.queries.level.elevation import PIXELS_MAX as ELEVATION_PIXELS_MAX
 from cairn_map.queries.level.elevation import Elevation, elevation_of
 from cairn_map.queries.occupancy_kernels import list_bits_into
 from cairn_map.queries.occupancy_states import State
@@ -78,7 +79,7 @@ def height_map(frozen: FrozenMap, box_m: Box | None) -> MapImage:
 def elevation(frozen: FrozenMap, box_m: Box | None, clearance_m: float) -> Elevation:
     """The surface of a level layer, over the columns of a box."""
     low, high = frozen.voxels_of_box(box_m)
-    check_pixels(low, high)
+    check_pixels(low, high, most=ELEVATION_PIXELS_MAX)
     side = frozen.geometry.side
     cells = (
         (frozen.keys[slot], frozen.cells[slot].packed())
@@ -100,15 +101,15 @@ def _question(frozen: FrozenMap, what: str) -> Callable[[Floats], Values]:
     return lambda points: point_queries.reading_at(frozen, points, channel).mean
 
 
-def check_pixels(low: Ints, high: Ints) -> None:
+def check_pixels(low: Ints, high: Ints, *, most: int = PIXELS_MAX) -> None:
     """Refuse images, of voxels from `low` up to `high`, that are larger than an image may be.
 
     Raises:
         BadInputError: kind `too_large`.
     """
     pixels = int(high[0] - low[0]) * int(high[1] - low[1])
-    if pixels > PIXELS_MAX:
-        raise BadInputError("too_large", f"an image has at most {PIXELS_MAX} pixels, not {pixels}; give a smaller box")
+    if pixels > most:
+        raise BadInputError("too_large", f"an image has at most {most} pixels, not {pixels}; give a smaller box")
 
 
 def _centres(frozen: FrozenMap, low: int, high: int) -> Floats:
@@ -123,7 +124,12 @@ def _image(frozen: FrozenMap, values: Values, low: npt.NDArray[np.int64]) -> Map
 
 
 def frontier(frozen: FrozenMap, box_m: Box | None) -> Ints:
-    """(M, 3) numbers of the free voxels of which a face borders on an unknown one."""
+    """(M, 3) numbers of the free voxels of which a face borders on an unknown one.
+
+    Raises:
+        BadInputError: kind `level_layer`.
+    """
+    check_cubes(frozen.geometry)
     low, high = frozen.voxels_of_box(box_m)
     corners = frozen.brick_corners()
     bits = np.empty((len(corners), 8), np.uint64)
@@ -133,7 +139,11 @@ def frontier(frozen: FrozenMap, box_m: Box | None) -> Ints:
 
 
 def frontier_cells(frozen: FrozenMap, box_m: Box | None) -> dict[Cell, int]:
-    """Cells with frontier voxels, and how many each has."""
+    """Cells with frontier voxels, and how many each has.
+
+    Raises:
+        BadInputError: kind `level_layer`.
+    """
     cells, counts = np.unique(frontier(frozen, box_m) >> frozen.geometry.depth, axis=0, return_counts=True)
     return {Cell(*cell): count for cell, count in zip(cells.tolist(), counts.tolist(), strict=True)}
 

@@ -34,6 +34,8 @@ BOX_PAUSE_FACTOR = 50.0
 Corner = tuple[int, int, int]
 Box = tuple[Corner, Corner]
 """Lowest and highest cell."""
+Edges = tuple[float, float, float]
+"""Edges of a cell along x, y and z, metres."""
 
 
 class Meter:
@@ -120,12 +122,12 @@ class Meter:
             return None
         with self._lock:
             reach = self._reaches.setdefault((row.number, author), _Reach(is_shared=self._is_shared))
-        edge_m = row.geometry.cell_edge_m
 
         def regions() -> Box | None:
             return _box_of_regions(self._store.shares.regions(row, author))
 
-        wide_m = reach.edge_cells(box, within=most_m / edge_m, read=regions, steady_s=self._steady_s) * edge_m
+        edges_m = row.geometry.cell_edges_m
+        wide_m = reach.edge_m(box, edges_m, within_m=most_m, read=regions, steady_s=self._steady_s)
         if wide_m > most_m:
             raise BadInputError(
                 "beyond_quota",
@@ -200,22 +202,28 @@ class _Reach:
         self._next_s = -math.inf
         """Steady time before which the box is not read again."""
 
-    def edge_cells(
-        self, box: Box, *, within: float, read: Callable[[], Box | None], steady_s: Callable[[], float]
-    ) -> int:
-        """Longest edge of the robot's box and another one together, in cells; read again if it exceeds `within`."""
+    def edge_m(
+        self,
+        box: Box,
+        edges_m: Edges,
+        *,
+        within_m: float,
+        read: Callable[[], Box | None],
+        steady_s: Callable[[], float],
+    ) -> float:
+        """Longest edge of the robot's box and another one together, metres; read again if it exceeds `within_m`."""
         with self._lock:
             is_known = self._next_s > -math.inf
             both = _widened(self._box, box)
             begun_s = steady_s()
-            if not is_known or (_edge_cells(both) > within and begun_s >= self._next_s):
+            if not is_known or (_edge_m(both, edges_m) > within_m and begun_s >= self._next_s):
                 self._box = read()
                 self._next_s = begun_s + max(BOX_EVERY_S, BOX_PAUSE_FACTOR * (steady_s() - begun_s))
-            elif self._is_shared and both != self._box and _edge_cells(both) <= within:
+            elif self._is_shared and both != self._box and _edge_m(both, edges_m) <= within_m:
                 # A robot is seldom at its border: what another server accepted there is read for each commit there.
                 found = read()
                 self._box = _widened(self._box, found) if found is not None else self._box
-            return _edge_cells(_widened(self._box, box))
+            return _edge_m(_widened(self._box, box), edges_m)
 
     def widen(self, box: Box) -> None:
         """Note that the robot has evidence in this box, too."""
@@ -251,9 +259,9 @@ def _corner(values: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> Corner:
     return i, j, k
 
 
-def _edge_cells(box: Box) -> int:
-    """Count of cells along the longest edge."""
-    return max(high - low + 1 for low, high in zip(*box, strict=True))
+def _edge_m(box: Box, edges_m: Edges) -> float:
+    """Longest edge of a box of cells with these edges, metres."""
+    return max((high - low + 1) * edge_m for low, high, edge_m in zip(*box, edges_m, strict=True))
 
 
 def _quota(message: str, wait_s: float) -> UnreachableError:

@@ -21,7 +21,7 @@ from cairn_map.commits.ids import CommitId
 from cairn_map.errors import BadInputError, DamagedDataError
 from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.evidence import Evidence
-from cairn_map.evidence.grid import Cell, CellKey, cell_key, centres_of_voxels, split_voxels
+from cairn_map.evidence.grid import Cell, CellKey, cell_key, centres_of_voxels, check_cubes, split_voxels
 from cairn_map.files.export_request import ExportRequest
 from cairn_map.queries.hot_spots import (
     WARM_K,
@@ -99,9 +99,10 @@ class HotSpotSearch:
 
         Raises:
             BadInputError: kind `bad_box`; `unknown_channel`: the map has no temperatures; `too_costly`: too much of
-                it is above the threshold.
+                it is above the threshold; `level_layer`.
             DamagedCellError: kind `damaged_store`: a cell is damaged.
         """
+        check_cubes(row.geometry)
         first_of_kind(row.geometry, ChannelKind.TEMPERATURE)
         box_m = ExportRequest(box=box).bounds_m()
         with self._cells.reading(row) as faults, self._store.snapshot(row) as snapshot:

@@ -101,7 +101,7 @@ class MapChangesSearch:
         """
         span, asked = span_of(row, since, until), ExportRequest(box=box)
         bounds_m = asked.bounds_m()
-        with self._turn(), self._cells.reading(row) as faults, self._store.snapshot(row) as snapshot:
+        with self.turn(), self._cells.reading(row) as faults, self._store.snapshot(row) as snapshot:
             listed = {cell.key: cell for cell in snapshot.cells() if cell.voxels}
             search = _Search(snapshot, row, span, listed, faults, bounds_m, end_s=time.monotonic() + SEARCH_S)
             for key in listed:
@@ -110,7 +110,12 @@ class MapChangesSearch:
             return search.answer()
 
     @contextmanager
-    def _turn(self) -> Iterator[None]:
+    def turn(self) -> Iterator[None]:
+        """Room for one search, or for a preview of a retract, for the length of a `with`.
+
+        Raises:
+            UnreachableError: kind `busy`: it did not come in time.
+        """
         if not self._room.acquire(timeout=WAIT_S):
             raise UnreachableError("busy", "others are looking for changes", retry_after_s=1.0)
         try:

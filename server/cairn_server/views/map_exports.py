@@ -139,9 +139,9 @@ class _PointFile:
     def __init__(self, row: MapRow, asked: ExportRequest) -> None:
         self.row, self.asked, self.until_s = row, asked, _until_s(asked)
         self._found = PointBounds()
-        edge_m = node_geometry(row.geometry, asked).voxel_edge_m
+        edges_m = node_geometry(row.geometry, asked).voxel_edges_m
         classes = next((channel.classes for channel in row.geometry.channels if channel.classes), ())
-        self._about = About(row.name, edge_m, has_times=row.layer.has_epochs, classes=classes)
+        self._about = About(row.name, edges_m, has_times=row.layer.has_epochs, classes=classes)
 
     def kept(self, key: CellKey, body: bytes, evidence: Evidence) -> bytes:
         """Bytes of a cell to be laid aside; empty if it has nothing that is asked for."""
@@ -195,7 +195,7 @@ class _TreeFile:
         return int(self._nodes["leaves"][0]) if len(self._nodes) else 0
 
     def parts(self, bodies: Iterator[tuple[CellKey, bytes]]) -> Iterator[bytes]:
-        about = str(About(self.row.name, node_geometry(self.row.geometry, self.asked).voxel_edge_m))
+        about = str(About(self.row.name, node_geometry(self.row.geometry, self.asked).voxel_edges_m))
         in_turn = (body for _, body in bodies)
         return tree_file(self.asked.format, self._nodes, in_turn, self.row.geometry, about)
 

@@ -21,6 +21,7 @@ from cairn_client.cli.doctor.site import checks_of
 from cairn_client.folders.map_copy import clone
 from cairn_client.http.api import MapApi
 from cairn_client.robot.robot import Robot
+from cairn_map.errors import BadInputError
 from cairn_map.evidence.grid import geometry_for
 from cairn_map.wire.access_messages import ServerInfo, SiteInfo
 
@@ -36,6 +37,12 @@ def test_an_installation_is_checked_without_a_server(capsys: pytest.CaptureFixtu
     assert code == 0
     assert {"python", "cairn", "extra robot", "extra server", "kernels", "disk"} == checks.keys()
     assert all(check["advice"] for check in checks.values() if check["verdict"] != "ok")
+
+
+def test_more_addresses_after_a_live_robot_s_door_are_refused() -> None:
+    with pytest.raises(BadInputError, match="http://base:8750") as refused:
+        main(["ws://127.0.0.1:9", "http://base:8750"])
+    assert refused.value.kind == "bad_option"
 
 
 def test_the_way_to_a_map_is_checked(server: LiveServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

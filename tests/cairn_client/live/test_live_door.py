@@ -16,12 +16,14 @@ import pytest
 from tests.fixtures.client.bridge import Bridge, a_bridge
 from tests.fixtures.client.live_run import MAKE, NOWHERE, TOPICS, VOXEL_M, LiveRun, replay_digest, send_all
 from tests.fixtures.client.live_server import WAIT_S, LiveServer, wait_until
+from tests.fixtures.client.made import MAP
 from tests.fixtures.fusion.bags import Timed
-from tests.fixtures.fusion.drive_mapping import mapping_text
-from tests.fixtures.fusion.live_drive import drive, latched
+from tests.fixtures.fusion.drive_mapping import LABELLED, mapping_text
+from tests.fixtures.fusion.live_drive import drive, labelled, latched
 from websockets.sync.server import ServerConnection, serve
 
 from cairn_client import main as cairn
+from cairn_client.http.api import MapApi
 from cairn_client.live.foxglove_source import FoxgloveSource
 from cairn_client.live.live_opening import OpenedLive, open_live, survey_live
 from cairn_client.live.live_source import LiveSource
@@ -31,6 +33,9 @@ from cairn_fusion.ros.bag_recording import Survey
 from cairn_fusion.ros.live_scans import Cause
 from cairn_fusion.ros.topic_mapping import BagMapping, mapping_from_yaml
 from cairn_map.errors import BadInputError
+from cairn_map.evidence.channels import classes_channel
+from cairn_map.evidence.grid import geometry_for
+from cairn_map.wire.layer_messages import AddLayer
 
 
 @pytest.fixture
@@ -286,6 +291,22 @@ def test_a_map_of_another_grid_is_refused(
     said = refused(capsys, tmp_path, bridge.url, "--map", server.map_url, "--voxel", "0.03")
     sender.join()
     assert "[other_geometry]" in said and "leave --voxel out" in said
+
+
+def test_labels_of_other_classes_than_the_layer_s_are_refused(
+    bridge: Bridge, server: LiveServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    classes = classes_channel(("wall", "table"))
+    with MapApi(server.url) as api:
+        api.add_layer(MAP, AddLayer(name="things", geometry=geometry_for(voxel_edge_m=VOXEL_M, channels=(classes,))))
+    timed = labelled(MAKE, drive(MAKE, scans=3))
+    bridge.offer_all(timed)
+    sender = threading.Thread(target=send_when_subscribed, args=(bridge, timed))
+    sender.start()
+    topics = mapping_text(**LABELLED)
+    said = refused(capsys, tmp_path, bridge.url, "--map", f"{server.map_url}.things", topics=topics)
+    sender.join()
+    assert "[unknown_class]" in said and "the labels name chair, and the map's classes are wall, table, other" in said
 
 
 def send_when_subscribed(bridge: Bridge, timed: Sequence[Timed]) -> None:

@@ -1,15 +1,15 @@
 """Recordings of live robots: what became scans, and nothing else, replays to the same map."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 from tests.fixtures.client.live_run import GRID, MAPPING, NOWHERE, Clock
 from tests.fixtures.fusion.bags import ROS1, ROS2, Messages, Timed
-from tests.fixtures.fusion.drive_mapping import KINDS, TOPICS, mapping_text
-from tests.fixtures.fusion.live_drive import drive
+from tests.fixtures.fusion.drive_mapping import KINDS, LABEL_KINDS, LABELLED, TOPICS, mapping_text
+from tests.fixtures.fusion.live_drive import drive, labelled
 
 from cairn_calib.rig.rig import Rig
 from cairn_client import main as cairn
@@ -26,6 +26,10 @@ from cairn_fusion.ros.messages import read_transforms
 from cairn_fusion.ros.scan_decoder import ScanDecoder
 from cairn_fusion.ros.topic_mapping import mapping_from_yaml, mapping_next_to
 from cairn_map.errors import ConflictError
+from cairn_map.evidence.channels import classes_channel
+from cairn_map.evidence.grid import Geometry, geometry_for
+
+THINGS = geometry_for(voxel_edge_m=0.05, channels=(classes_channel(("wall", "chair")),))
 
 
 def message_of(entry: Timed, make: Messages) -> BagMessage:
@@ -49,12 +53,20 @@ def with_odometry(make: Messages, timed: Sequence[Timed]) -> list[Timed]:
 
 
 def recorded(
-    folder: Path, rig: Rig, timed: Sequence[Timed], make: Messages, *, gate: ScanGate, poses: str = "/tf"
+    folder: Path,
+    rig: Rig,
+    timed: Sequence[Timed],
+    make: Messages,
+    *,
+    gate: ScanGate,
+    poses: str = "/tf",
+    changes: Mapping[str, object] | None = None,
+    grid: Geometry = GRID,
 ) -> tuple[str, int]:
     """Digest of the live map, and the number of scans recorded into `folder`."""
-    kinds = {**KINDS, "/odom": "nav_msgs/Odometry"} if poses == "/odom" else KINDS
+    kinds = {**KINDS, **LABEL_KINDS, **({"/odom": "nav_msgs/Odometry"} if poses == "/odom" else {})}
     topics = {name: Topic(name, kind, Wire.ROS1 if make.is_ros1 else Wire.CDR, 0) for name, kind in kinds.items()}
-    mapping = mapping_from_yaml(mapping_text(poses={"topic": poses, "max_gap_s": 0.3}), "drive")
+    mapping = mapping_from_yaml(mapping_text(poses={"topic": poses, "max_gap_s": 0.3}, **(changes or {})), "drive")
     scans, clock = LiveScans("drive", mapping, topics), Clock()
     messages = [message_of(entry, make) for entry in timed]
     wire = Wire.ROS1 if make.is_ros1 else Wire.CDR
@@ -62,7 +74,7 @@ def recorded(
     infos = {one.topic: one for one in reversed(messages) if one.topic.endswith("/info")}
     opened = OpenedLive(rig, scans, topics, np.eye(4), tuple(fixed), tuple(infos.values()), [], Counter())
     recorder = ScanRecorder(folder, opened, mapping)
-    with Robot(rig, NOWHERE, directory=folder.parent / "live", name="live", geometry=GRID, stay=True) as robot:
+    with Robot(rig, NOWHERE, directory=folder.parent / "live", name="live", geometry=grid, stay=True) as robot:
         decoder = ScanDecoder("drive", mapping, rig, topics)
         live = LiveMapping(robot, scans, decoder, gate, on_taken=recorder.add, steady_s=clock)
         for message in messages:
@@ -108,6 +120,34 @@ def test_a_camera_that_no_scan_had_is_left_out(rig: Rig, tmp_path: Path) -> None
     assert mapping is not None and set(mapping.cameras) == {"depth", "colour"}
     replay = open_bag_recording(folder, mapping)
     with Robot(replay.rig, NOWHERE, directory=tmp_path / "other", name="other", geometry=GRID, stay=True) as robot:
+        for scan in replay:
+            robot.observe(scan)
+        robot.commit()
+        assert robot.map.digest() == digest
+
+
+@pytest.mark.parametrize(
+    ("gone", "left"),
+    [
+        ("nothing", {"depth": "/depth/labels", "colour": "/colour/labels"}),
+        ("/colour/image", {"depth": "/depth/labels", "colour": "/colour/labels"}),
+        ("/colour/labels", {"depth": "/depth/labels"}),
+        ("labels", {}),
+    ],
+)
+def test_label_images_are_recorded_with_the_names_of_their_numbers(
+    gone: str, left: dict[str, str], rig: Rig, tmp_path: Path
+) -> None:
+    make, folder = Messages(ROS2), tmp_path / "lab"
+    timed = [entry for entry in labelled(make, drive(make, scans=10)) if not entry[1].endswith(gone)]
+    digest, _ = recorded(folder, rig, timed, make, gate=ScanGate(None), changes=LABELLED, grid=THINGS)
+    mapping = mapping_next_to(folder)
+    assert mapping is not None
+    assert {name: camera.labels for name, camera in mapping.cameras.items() if camera.labels} == left
+    assert mapping.label_names == ({0: None, 1: "wall", 300: "chair"} if left else {})
+    assert (mapping.cameras["colour"].topic is None) is (gone == "/colour/image")
+    replay = open_bag_recording(folder, mapping)
+    with Robot(replay.rig, NOWHERE, directory=tmp_path / "other", name="other", geometry=THINGS, stay=True) as robot:
         for scan in replay:
             robot.observe(scan)
         robot.commit()

@@ -13,6 +13,10 @@ from tests.fixtures.client.live_server import LiveServer
 from tests.fixtures.client.made import MAP
 from tests.fixtures.client.robot_program import INTEGRATOR, RIG, scan_of
 from tests.fixtures.commands import cairn
+from tests.fixtures.fusion.bags import write_bag
+from tests.fixtures.fusion.drive_mapping import LABELLED, mapping_text
+from tests.fixtures.fusion.live_drive import drive, in_bag_order
+from tests.fixtures.fusion.live_drive import labelled as labelled_drive
 
 from cairn_client.folders.map_folder import open_layers, open_map
 from cairn_client.http.api import MapApi
@@ -115,6 +119,17 @@ def test_a_layer_of_classes_is_drawn_saved_and_told_apart_by_old_clients(server:
         assert {each["name"] for each in listed} == names
         layers = httpx.get(f"{server.map_url}/layers", headers=headers).json()
         assert {each["map"] for each in layers} == names
+
+
+def test_label_images_of_a_bag_become_classes(server: LiveServer, tmp_path: Path) -> None:
+    url = add_layer(server, tmp_path, "--classes", "wall,chair")
+    write_bag(tmp_path / "drive", "mcap", lambda make: in_bag_order(labelled_drive(make, drive(make, scans=3))))
+    (tmp_path / "topics.yaml").write_text(mapping_text(**LABELLED))
+    bag = ("drive/drive.mcap", "--topics", "topics.yaml")
+    cairn("robot", "replay", *bag, "--map", url, "--name", "mole", folder=tmp_path)
+    snapshot = open_map(url)
+    found = snapshot.class_at(snapshot.occupied_in().centres_m)
+    assert {"wall", "chair"} <= {*found.class_names} <= {"wall", "chair", None}
 
 
 def test_a_retract_takes_the_votes_out_again(server: LiveServer, tmp_path: Path) -> None:

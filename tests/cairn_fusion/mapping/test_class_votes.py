@@ -1,5 +1,6 @@
 """Votes of label images: against a slow twin, in any order, from any camera; and what label images may not be."""
 
+import tracemalloc
 from collections import Counter
 from dataclasses import replace
 
@@ -92,6 +93,20 @@ def test_another_camera_labels_what_it_sees_and_each_camera_has_a_vote() -> None
     assert weights[0] > 0 and weights[1] > 0 and weights[2] == weights[0] + weights[1]
     cast = integrate_scan(own, RIG, GEOMETRY, integrator=Integrator(method=IntegrationMethod.CAST))
     assert any(len(cell.sampled) for cell in cast.values())
+
+
+def test_votes_for_many_classes_take_little_more_memory_than_their_evidence() -> None:
+    many = Geometry(voxel_edge_um=100_000, depth=4, channels=(classes_channel(tuple(f"c{n}" for n in range(63))),))
+    voxels = np.stack(np.unravel_index(np.arange(16**4), (64, 32, 32)), axis=1).astype(np.int64)
+    votes, rng = class_votes.ClassVotes(many), np.random.default_rng(1)
+    for camera in "abcde":
+        votes._count(camera, voxels, np.arange(len(voxels)), rng.integers(0, 64, len(voxels)))
+    tracemalloc.start()
+    diff = votes.diff()
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert sum(int(cell.samples[:, -1].sum()) for cell in diff.values()) == 5 * len(voxels)
+    assert peak < 2 * sum(cell.size_bytes for cell in diff.values())
 
 
 def test_labels_of_a_map_without_classes_are_left_aside() -> None:

@@ -10,6 +10,7 @@ import pytest
 from tests.fixtures.fusion.scans import PINHOLE, random_scan, rig_of
 
 from cairn_fusion.recording.recording import open_recording
+from cairn_fusion.recording.recording_format import repeated
 from cairn_fusion.recording.recording_writer import RecordingWriter
 from cairn_map.errors import BadInputError, CairnError, DamagedDataError
 
@@ -68,6 +69,46 @@ def test_a_table_that_cannot_be_is_refused_when_opened(folder: Path, table: obje
     changed(folder, table)
     with pytest.raises(CairnError):
         open_recording(folder)
+
+
+@pytest.mark.parametrize("table", [{1: "Wall"}, {1: ["wall"]}, {1: "a" * 33}, {"1": "wall"}, {True: "floor"}])
+def test_a_table_that_could_not_be_opened_is_not_written(tmp_path: Path, table: dict[int, str | None]) -> None:
+    labels = {"tof": np.ones((30, 40), np.uint8)}
+    with RecordingWriter(tmp_path / "bad", rig_of(PINHOLE), name="bad") as recording:
+        with pytest.raises(BadInputError) as refused:
+            recording.add(replace(random_scan(PINHOLE, 1), labels=labels, label_names=table))
+        assert refused.value.kind == "bad_labels"
+        assert not (tmp_path / "bad" / "images").exists()
+    assert len(open_recording(tmp_path / "bad")) == 0
+
+
+def test_a_table_too_large_for_the_header_is_refused_before_the_first_image(tmp_path: Path) -> None:
+    labels = {"tof": np.ones((30, 40), np.uint8)}
+    names = dict.fromkeys(range(1 << 15), "a" * 32)
+    with RecordingWriter(tmp_path / "large", rig_of(PINHOLE), name="large") as recording:
+        with pytest.raises(BadInputError, match="leave out the numbers") as refused:
+            recording.add(replace(random_scan(PINHOLE, 1), labels=labels, label_names=names))
+        assert refused.value.kind == "bad_labels"
+        assert not (tmp_path / "large" / "images").exists()
+        recording.add(replace(random_scan(PINHOLE, 1), labels=labels, label_names=NAMES))
+    assert open_recording(tmp_path / "large").scan(0).label_names == NAMES
+
+
+def test_keys_of_a_table_are_not_compared_each_with_each() -> None:
+    compared = []
+
+    class Key(str):
+        __slots__ = ()
+        __hash__ = str.__hash__
+
+        def __eq__(self, other: object) -> bool:
+            compared.append(self)
+            return str.__eq__(self, other)
+
+    keys = [Key(number) for number in range(1000)]
+    assert repeated(keys) == []
+    assert repeated([*keys, Key(7), Key(7)]) == ["7"]
+    assert len(compared) < 4 * len(keys)
 
 
 def test_a_number_that_stands_twice_in_the_table_is_refused(folder: Path) -> None:

@@ -32,6 +32,13 @@ def random_scan(seed: int) -> Scan:
     )
 
 
+@pytest.mark.parametrize("name", [["wall"], {"wall": 1}, 7, True])
+def test_the_name_of_a_label_is_text(name: object) -> None:
+    scan = dataclasses.replace(random_scan(1), label_names={7: name})
+    with pytest.raises(DamagedDataError, match="name of a label"):
+        decode_scan(encode_scan(scan))
+
+
 def bits(value: object) -> object:
     if isinstance(value, np.ndarray):
         return value.dtype, value.shape, value.tobytes()

@@ -1,22 +1,23 @@
 """Live scans: messages in any order become the scans of a replay, and what becomes none says why."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 import pytest
 from tests.fixtures.fusion.bags import ROS2, Messages, Timed, write_bag
-from tests.fixtures.fusion.drive_mapping import TOPICS, mapping_text
-from tests.fixtures.fusion.live_drive import START_S, bag_message, depth, drive, in_bag_order, latched, moving
+from tests.fixtures.fusion.drive_mapping import LABEL_KINDS, LABELLED, TOPICS, mapping_text
+from tests.fixtures.fusion.live_drive import START_S, bag_message, depth, drive, in_bag_order, labelled, latched, moving
 
 from cairn_calib.rig.rig import Rig
 from cairn_fusion.recording.scan_bytes import encode_scan
-from cairn_fusion.ros.bag import BagMessage
+from cairn_fusion.ros.bag import BagMessage, Topic, Wire
 from cairn_fusion.ros.bag_recording import BagRecording, open_bag_recording
 from cairn_fusion.ros.live_frames import LiveFrames
 from cairn_fusion.ros.live_scans import Cause, LiveScans, ReadyScan
 from cairn_fusion.ros.messages import RosTransform
 from cairn_fusion.ros.scan_decoder import ScanDecoder
-from cairn_fusion.ros.topic_mapping import mapping_from_yaml
+from cairn_fusion.ros.topic_mapping import BagMapping, mapping_from_yaml
 from cairn_map.errors import BadInputError
 
 MAKE = Messages(ROS2)
@@ -34,8 +35,10 @@ def live(**options: float) -> LiveScans:
     return LiveScans("drive", MAPPING, TOPICS, **options)  # type: ignore[arg-type]
 
 
-def decoded(ready: Sequence[ReadyScan], rig: Rig) -> list[bytes]:
-    decoder = ScanDecoder("drive", MAPPING, rig, TOPICS)
+def decoded(
+    ready: Sequence[ReadyScan], rig: Rig, mapping: BagMapping = MAPPING, topics: Mapping[str, Topic] = TOPICS
+) -> list[bytes]:
+    decoder = ScanDecoder("drive", mapping, rig, topics)
     scans = [decoder.decode(one.found, one.messages.__getitem__, one.pose_at) for one in ready]
     return [encode_scan(scan) for scan in sorted(scans, key=lambda scan: scan.time_s)]
 
@@ -61,6 +64,21 @@ def test_in_any_order_of_topics_the_scans_are_those_of_a_replay(replay: BagRecor
     ready = received(scans, DRIVE, delays_s.tolist())
     assert decoded(ready, replay.rig) == [encode_scan(scan) for scan in replay]
     assert sum(scans.arrived.values()) == 40 == len(ready) + sum(scans.left_out.values())
+
+
+def test_label_images_are_waited_for_and_go_with_the_scans_of_a_replay(tmp_path: Path) -> None:
+    timed = labelled(MAKE, drive(MAKE, scans=12))
+    mapping = mapping_from_yaml(mapping_text(**LABELLED), "drive")
+    topics = TOPICS | {topic: Topic(topic, kind, Wire.CDR, 0) for topic, kind in LABEL_KINDS.items()}
+    path = write_bag(tmp_path / "drive", "mcap", lambda make: in_bag_order(timed))
+    replay = open_bag_recording(path, mapping)
+    scans = LiveScans("drive", mapping, topics)
+    # A network takes its time; nothing else comes late.
+    ready = received(scans, timed, [0.3 if topic.endswith("labels") else 0.0 for _, topic, _ in timed])
+    assert decoded(ready, replay.rig, mapping, topics) == [encode_scan(scan) for scan in replay]
+    labels = [{*scan.labels} for scan in replay]
+    assert all("depth" in each for each in labels) and {"depth", "colour"} in labels
+    assert sum(one.found.images.keys() == one.messages.keys() for one in ready) == len(ready) == len(replay)
 
 
 def test_each_scan_is_out_before_the_drive_is_over(replay: BagRecording) -> None:

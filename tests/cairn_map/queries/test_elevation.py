@@ -2,6 +2,7 @@
 
 import io
 import math
+import tracemalloc
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -12,7 +13,9 @@ from cairn_map.errors import BadInputError
 from cairn_map.evidence.evidence import packed_evidence
 from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.grid import Geometry, cell_key, level_geometry
+from cairn_map.queries import region_queries
 from cairn_map.queries.layered_snapshot import LayeredSnapshot
+from cairn_map.queries.level import elevation
 from cairn_map.queries.level.elevation import Elevation, Vehicle
 from cairn_map.queries.map_snapshot import MapSnapshot, snapshot_of
 from cairn_map.queries.occupancy_states import State
@@ -108,6 +111,52 @@ def test_slopes_roughness_and_steps_of_known_shapes() -> None:
     assert at(line, line.difficulty(), 2, 1) == 0
 
 
+def test_tiles_are_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(5)
+    votes = [
+        (x, y, rng.normal(1 + 0.1 * x, 0.05)) for x in range(9) for y in range(11) if (x + y) % 5 for _ in range(4)
+    ]
+    snapshot = snapshot_with(votes)
+    whole = snapshot.elevation().arrays()
+    for pixels in (1, 7, 300):
+        monkeypatch.setattr(elevation, "TILE_PIXELS", pixels)
+        tiled = snapshot.elevation().arrays()
+        assert all(np.array_equal(tiled[name], whole[name], equal_nan=True) for name in whole)
+
+
+def test_an_elevation_takes_little_more_memory_than_its_answer_and_has_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    total = EvidenceMap(LEVEL)
+    one = packed_evidence(np.zeros(1, np.uint32), np.array([[1, 0]]), np.array([[0, 2]]), LEVEL)
+    total.merge({cell_key((0, 0, 0)): one, cell_key((15, 15, 0)): one})
+    snapshot = snapshot_of(total)
+    tracemalloc.start()
+    ground = snapshot.elevation()
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    pixels = ground.height_m.size
+    assert pixels > 10 * elevation.TILE_PIXELS
+    assert peak < 100 * pixels
+    monkeypatch.setattr(region_queries, "ELEVATION_PIXELS_MAX", pixels - 1)
+    with pytest.raises(BadInputError, match="give a smaller box") as refused:
+        snapshot.elevation()
+    assert refused.value.kind == "too_large"
+    assert snapshot.elevation(box_m=[[0, 0, 0], [2, 2, 2]]).votes.sum() == 2
+
+
+def test_a_long_row_takes_no_more_memory_than_a_square() -> None:
+    total = EvidenceMap(LEVEL)
+    one = packed_evidence(np.zeros(1, np.uint32), np.array([[1, 0]]), np.array([[0, 2]]), LEVEL)
+    far = 8 * elevation.TILE_PIXELS // LEVEL.side
+    total.merge({cell_key((0, 0, 0)): one, cell_key((far, 0, 0)): one})
+    snapshot, box_m = snapshot_of(total), [[0, 0, 0], [far * LEVEL.cell_edge_m + 0.2, 0.2, 1]]
+    tracemalloc.start()
+    row = snapshot.elevation(box_m=box_m)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert (len(row.height_m), row.votes.sum()) == (1, 4)
+    assert peak < 100 * row.height_m.size
+
+
 def test_points_and_slices_of_flat_voxels_are_where_they_are() -> None:
     snapshot = snapshot_with([(1, 2, 0.52)] * 4, passed=[(1, 2, 40)])
     points = [[0.3, 0.5, 0.51], [0.3, 0.5, 0.549], [0.3, 0.5, 0.55], [0.3, 0.5, 2.01], [0.3, 0.5, 0.49]]
@@ -127,6 +176,8 @@ def test_points_and_slices_of_flat_voxels_are_where_they_are() -> None:
         lambda level: level.floor_grid(ground_m=0),
         lambda level: level.grounds(),
         lambda level: level.hot_spots(),
+        lambda level: level.frontier(),
+        lambda level: level.frontier_cells(),
     ],
 )
 def test_questions_about_space_are_refused(ask: Callable[[MapSnapshot], object]) -> None:

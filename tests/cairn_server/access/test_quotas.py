@@ -15,7 +15,7 @@ from tests.fixtures.server.quotas import MOLE_CALLER, SIZE, Clock, assert_waits,
 from cairn_client.http.api import MapApi
 from cairn_map.commits.commit import Commit
 from cairn_map.errors import BadInputError, UnreachableError
-from cairn_map.evidence.grid import BRICK_DEPTH, Geometry, cell_key
+from cairn_map.evidence.grid import BRICK_DEPTH, Geometry, cell_key, level_geometry
 from cairn_map.wire.access_messages import CreateToken
 from cairn_server.access import quotas
 from cairn_server.access.auth import ADMIN_FILE, UPSTREAM, Caller, Role
@@ -217,6 +217,18 @@ def test_a_robot_s_cells_span_the_map_s_extent_and_a_retract_makes_room(
         assert live.http.post(f"/maps/{row.name}/retracts", json=body, headers=bearer(ADMIN)).status_code == 201
         live.folded(row)
         assert live.push(row, far(2, 0), headers=mole).status_code == 201
+
+
+def test_the_extent_of_a_level_counts_its_cells_height_along_z(tmp_path: Path) -> None:
+    level = level_geometry()
+    edge_m, _, height_m = level.cell_edges_m
+    assert edge_m == 4 * height_m
+    with metered(tmp_path, Clock(), geometry=level, map_extent_m=8 * height_m) as (meter, row):
+        for corner, is_within in (((1, 0, 7), True), ((0, 0, 8), False), ((2, 0, 0), False)):
+            cells = [cell_key((0, 0, 0)), cell_key(corner)]
+            expected = nullcontext() if is_within else pytest.raises(BadInputError, match="would span")
+            with expected, meter.spending(row, MOLE_CALLER, size_bytes=1, cells=cells):
+                pass
 
 
 def test_the_box_of_a_robot_is_not_read_anew_for_every_refusal(tmp_path: Path) -> None:

@@ -88,6 +88,7 @@ def test_a_commit_has_one_vote_for_a_class_per_voxel_and_sensor(live: Live) -> N
         ([5, 0, 0, 5], (), 400),
         ([0, 0, 8, 8], ("a", "b"), 201),
         ([0, 0, 0, 9], ("a", "b"), 400),
+        ([0, 0, 0, 5], ("a", "a"), 400),
     ):
         evidence = packed_evidence(np.array([3], np.uint32), np.array([[1, 0]]), np.array([votes]), CLASSED)
         commit = pushed(0, 0, geometry=CLASSED, cells={KEYS[0]: evidence}, sensors=sensors)

@@ -16,11 +16,11 @@ from tests.fixtures.map.made import SMALL, surface_evidence
 from tests.fixtures.server.answers import kind_of
 from tests.fixtures.server.exports import ask_export, mapped, places, points
 from tests.fixtures.server.live import Live
-from tests.fixtures.server.pushes import pushed
+from tests.fixtures.server.pushes import KEYS, pushed
 from tests.naive.octomap import read_tree, states_of
 
 from cairn_map.evidence.evidence import packed_evidence
-from cairn_map.evidence.grid import cell_key
+from cairn_map.evidence.grid import cell_key, level_geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.files.export_request import ExportRequest
 from cairn_map.files.laz import LazHead, laz_parts
@@ -67,10 +67,25 @@ def test_laz_says_the_same_as_the_arrays(live: Live, backend: LazBackend) -> Non
     assert 'UNIT["metre",1]' in found.header.vlrs.get("WktCoordinateSystemVlr")[0].string
 
 
+def test_heights_of_a_level_are_those_of_the_arrays(live: Live) -> None:
+    level = level_geometry().model_copy(update={"depth": 4})
+    row = live.new_map(level)
+    assert live.push(
+        row, pushed(0, 0, geometry=level, cells={KEYS[1]: surface_evidence(1, level)}, scans=64)
+    ).is_success
+    live.folded(row)
+    table = points(ask_export(live, row, format="npz"))
+    found = read_laz(ask_export(live, row, format="laz").content)
+    assert len(np.unique(table["z"])) > 1
+    np.testing.assert_allclose(found.xyz, places(table), atol=1e-5)
+    np.testing.assert_allclose(found.header.scales, [0.1, 0.1, 0.025])
+    assert b"nodes of 0.2 m and 0.05 m height" in ask_export(live, row, format="ply").content
+
+
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("count", [0, 1, 130_000])
 def test_laz_of_any_size_is_read_from_its_beginning_to_its_end(count: int, backend: LazBackend) -> None:
-    head = LazHead(count, np.zeros(3), np.ones(3), 0.04, "map lab")
+    head = LazHead(count, np.zeros(3), np.ones(3), (0.04,) * 3, "map lab")
     found = read_laz(b"".join(laz_parts(head, parts_of(count))), backend)
     expected = np.concatenate([np.zeros(0, POINT), *parts_of(count)])
     np.testing.assert_array_equal(found["temperature"], expected["temperature"])
@@ -78,7 +93,7 @@ def test_laz_of_any_size_is_read_from_its_beginning_to_its_end(count: int, backe
 
 
 def test_any_chunk_of_a_laz_is_found_by_its_table() -> None:
-    head = LazHead(130_000, np.zeros(3), np.ones(3), 0.04, "map lab")
+    head = LazHead(130_000, np.zeros(3), np.ones(3), (0.04,) * 3, "map lab")
     with laspy.open(io.BytesIO(b"".join(laz_parts(head, parts_of(130_000)))), laz_backend=LazBackend.Lazrs) as file:
         file.seek(110_000)
         np.testing.assert_allclose(file.read_points(1).x, (110_000 // 100 + 0.5) * 0.04)
@@ -86,7 +101,7 @@ def test_any_chunk_of_a_laz_is_found_by_its_table() -> None:
 
 def test_a_laz_is_made_with_the_memory_of_a_chunk() -> None:
     tracemalloc.start()
-    head = LazHead(1_000_000, np.zeros(3), np.ones(3), 0.04, "map lab")
+    head = LazHead(1_000_000, np.zeros(3), np.ones(3), (0.04,) * 3, "map lab")
     size = sum(len(part) for part in laz_parts(head, parts_of(1_000_000)))
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()

@@ -1,20 +1,32 @@
 """`POST .../main/changes`: the voxels that a retract would change are exactly those that it changes."""
 
+import math
+from collections.abc import Iterable, Iterator
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
-from tests.fixtures.map.made import SMALL
+from tests.fixtures.map.made import SMALL, random_evidence
 from tests.fixtures.server.epoch_pushes import pushed_in
 from tests.fixtures.server.live import Live
-from tests.fixtures.server.pushes import MOLE, WREN, pushed
+from tests.fixtures.server.pushes import KEYS, MOLE, WREN, pushed
 
 from cairn_map.codec.view_code import decode_view
 from cairn_map.commits.commit import Commit
 from cairn_map.epochs.epoch import Epoch
+from cairn_map.epochs.history_cell import HistoryCell
 from cairn_map.epochs.layer import MapLayer
-from cairn_map.evidence.grid import centres_of_voxels
+from cairn_map.errors import BadInputError, UnreachableError
+from cairn_map.evidence.grid import CellKey, centres_of_voxels
 from cairn_map.kernels.morton_kernels import deinterleave
 from cairn_map.wire.change_messages import CellVoxels, RetractChanges
-from cairn_server.store.store_rows import MapRow
+from cairn_map.wire.messages import Retract
+from cairn_server.access.cancellation import CANCELLATION, Cancellation, StopTime
+from cairn_server.cell_room import DECODING
+from cairn_server.folding.cells_at_rest import sum_of_contributions
+from cairn_server.store.store import Snapshot
+from cairn_server.store.store_rows import Contribution, MapRow
+from cairn_server.views import map_changes, retract_preview
 
 Looks = dict[tuple[float, ...], tuple[int, ...]]
 """By the centre of a voxel what a view shows of it: probability, temperature (-1: none), colour."""
@@ -90,3 +102,59 @@ def test_previews_are_refused_as_retracts_are(live: Live) -> None:
     unknown = live.http.post(f"/maps/{row.name}/main/changes", json={"commits": [f"{WREN}.7"]})
     assert unknown.json()["commits"] == 0
     assert f"{MOLE}.0" in live.http.get(f"/maps/{row.name}/log").text
+
+
+@pytest.mark.parametrize("mark", ["time", "cancelled"])
+def test_a_preview_ends_between_two_contributions_of_one_cell(
+    live: Live, monkeypatch: pytest.MonkeyPatch, mark: str
+) -> None:
+    row = live.new_map(SMALL)
+    commits = [pushed(n, 0, cells={KEYS[0]: random_evidence(n, SMALL, voxels=6, air=1)}) for n in range(4)]
+    for commit in commits:
+        assert live.push(row, commit).status_code == 201
+    live.folded(row)
+    cancellation, decoded = Cancellation(StopTime()), list[Contribution]()
+
+    def first(snapshot: Snapshot, key: CellKey, entries: Iterable[Contribution], layer: MapLayer) -> HistoryCell:
+        def counted() -> Iterator[Contribution]:
+            for entry in entries:
+                decoded.append(entry)
+                yield entry
+                if mark == "cancelled":
+                    cancellation.cancel()
+                else:
+                    monkeypatch.setattr(retract_preview, "time", SimpleNamespace(monotonic=lambda: math.inf))
+
+        return sum_of_contributions(snapshot, key, counted(), layer)
+
+    monkeypatch.setattr(retract_preview, "sum_of_contributions", first)
+    token = CANCELLATION.set(cancellation)
+    try:
+        with pytest.raises(BadInputError) as ended:
+            live.service.views.retracts.asked(row, Retract(commits=[str(each.id) for each in commits]))
+    finally:
+        CANCELLATION.reset(token)
+    assert ended.value.kind == {"time": "too_costly", "cancelled": "cut_off"}[mark]
+    assert len(decoded) == 1
+
+
+def test_a_preview_has_the_bounds_of_a_search_for_changes(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
+    row = live.new_map(SMALL)
+    commits = [pushed(n, 0) for n in range(3)]
+    for commit in commits:
+        assert live.push(row, commit).status_code == 201
+    live.folded(row)
+    views, request = live.service.views, Retract(commits=[str(each.id) for each in commits])
+    with monkeypatch.context() as bounded:
+        bounded.setattr(retract_preview, "PAST_ENTRIES_MAX", 2)
+        with pytest.raises(BadInputError, match="more than 2 of the commits") as costly:
+            views.retracts.asked(row, request)
+        assert views.retracts.asked(row, Retract(commits=request.commits[:2])).commits == 2
+    with monkeypatch.context() as bounded:
+        bounded.setattr(DECODING, "limit_bytes", 1)
+        with pytest.raises(BadInputError, match="too large to be compared"):
+            views.retracts.asked(row, request)
+    monkeypatch.setattr(map_changes, "WAIT_S", 0.0)
+    with views.changes.turn(), views.changes.turn(), pytest.raises(UnreachableError) as busy:
+        views.retracts.asked(row, request)
+    assert (costly.value.kind, busy.value.kind) == ("too_costly", "busy")

@@ -5,12 +5,13 @@ from itertools import product
 import numpy as np
 import pytest
 from tests.fixtures.map.made import PLAIN, SMALL, surface_evidence
+from tests.fixtures.server.answers import kind_of
 from tests.fixtures.server.live import Live
 from tests.fixtures.server.pushes import pushed
 
 from cairn_client.folders.map_folder import open_map
 from cairn_map.arrays import Floats
-from cairn_map.evidence.grid import cell_key
+from cairn_map.evidence.grid import cell_key, level_geometry
 from cairn_map.wire.spread_messages import BINS_MAX, Spread, SpreadAnswer
 from cairn_server.store.store_rows import MapRow
 from cairn_server.views import value_spread
@@ -54,6 +55,17 @@ def test_all_occupied_voxels_are_counted_by_height_and_temperature(live: Live) -
     edge_m = SMALL.voxel_edge_m
     assert_counts(found.height, (voxels.numbers[:, 2] + 0.5) * edge_m, edge_m, voxels.numbers[:, 2])
     assert_counts(found.temperature, kelvin, STEP_K, np.floor(kelvin / STEP_K))
+
+
+def test_heights_of_a_level_are_counted_by_the_height_of_its_voxels(live: Live) -> None:
+    level = level_geometry().model_copy(update={"depth": 4})
+    row = live.new_map(level)
+    commit = pushed(0, 0, geometry=level, cells={CELLS[0]: surface_evidence(1, level)}, scans=SCANS)
+    assert live.push(row, commit).status_code == 201
+    live.folded(row)
+    layers = open_map(f"http://127.0.0.1:{live.port}/maps/{row.name}").occupied_in().numbers[:, 2]
+    assert_counts(asked(live, row).height, (layers + 0.5) * 0.05, 0.05, layers)
+    assert kind_of(live.http.get(f"/maps/{row.name}/main/hotspots")) == "level_layer"
 
 
 def test_a_cell_is_counted_again_only_when_it_changed(live: Live) -> None:

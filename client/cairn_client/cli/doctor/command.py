@@ -75,6 +75,8 @@ def main(argv: list[str]) -> int:
     is_live = target.startswith(SCHEMES)
     if not is_live and (args.topics or args.ca):
         raise BadInputError("bad_option", f"--topics and --ca are of a live robot; {URL_HELP}")
+    if is_live and args.others:
+        raise BadInputError("bad_option", f"a live robot has one door; check {args.others[0]} by a command of its own")
     found = _live(target, args.topics, args.ca) if is_live else _checks(args.target, args.others, args.token)
     for check in found:
         checks.append(check)

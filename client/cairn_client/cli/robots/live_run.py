@@ -20,9 +20,11 @@ from cairn_client.live.path_corrections import PathCorrections
 from cairn_client.live.scan_recorder import ScanRecorder
 from cairn_client.robot.robot import Robot
 from cairn_client.sync.responses import one_line
+from cairn_fusion.mapping.class_votes import check_label_names
 from cairn_fusion.ros.scan_decoder import ScanDecoder
 from cairn_fusion.ros.topic_mapping import BagMapping
 from cairn_map.codec.cell_code import Profile
+from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import USAGE, BadInputError, CairnError
 from cairn_map.evidence.channels import COLOUR, INTENSITY, TEMPERATURE, Channel
 from cairn_map.progress import StatusLine
@@ -64,7 +66,7 @@ def run_live(args: argparse.Namespace) -> int:
                 name=name,
                 token=args.token.of(args.map),
                 mode=args.mode,
-                geometry=ensure_map(args, lambda: _channels(mapping)),
+                geometry=_layer_of(args, mapping),
                 integrator=integrator_of(args),
                 scope=scope_of(args, args.mode),
                 limits=limits,
@@ -89,9 +91,20 @@ def _corrections(mapping: BagMapping, opened: OpenedLive, robot: Robot) -> PathC
     return PathCorrections(robot, topic=given.topic, frame=frame, T_path_rig=opened.T_path_rig)
 
 
+def _layer_of(args: argparse.Namespace, mapping: BagMapping) -> MapLayer:
+    """The map's layer, made if that is asked for.
+
+    Raises:
+        BadInputError: kind `unknown_class`: the labels have names that the layer's classes lack.
+    """
+    layer = ensure_map(args, lambda: _channels(mapping))
+    check_label_names(mapping.label_names, layer.geometry)
+    return layer
+
+
 def _channels(mapping: BagMapping) -> tuple[Channel, ...]:
     """Channels that the cameras of a mapping can fill."""
-    spectra = {camera.spectrum for camera in mapping.cameras.values()}
+    spectra = {camera.spectrum for camera in mapping.cameras.values() if camera.topic is not None}
     has_amplitude = any(camera.amplitude is not None for camera in mapping.cameras.values())
     has = (
         (COLOUR, Spectrum.COLOUR in spectra),

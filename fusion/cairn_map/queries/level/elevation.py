@@ -10,7 +10,8 @@ scans saw it. From the heights of a column and its eight neighbours come the slo
 through them, and the step.
 """
 
-from collections.abc import Iterable
+import itertools
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,6 +34,12 @@ CLEARANCE_M = 1.5
 """Height of a usual vehicle: what is higher above the ground does not hinder it."""
 PLANE_MIN = 5
 """Columns of 3 x 3 with a height through which a plane is laid, at least."""
+PIXELS_MAX = 1 << 24
+"""Pixels of an elevation, at most: 57 bytes each, so that it takes 1 GB."""
+TILE_PIXELS = 1 << 16
+"""Pixels whose planes are laid at once."""
+Part = tuple[slice, slice]
+"""Part of an image: rows, columns."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -143,21 +150,30 @@ def elevation_of(
         count,
         obstacle,
     )
-    # Stage 3: what the neighbours say.
-    height_m = height.reshape(H, W) / 1e3
-    slope, roughness, step = _around(height_m, geometry.voxel_edge_m)
-    spread2 = variance.reshape(H, W) / 1e6 + (VOTE_SPREAD * step_mm / 1e3) ** 2
-    rise_m = np.nan_to_num(np.tan(slope)) * geometry.voxel_edge_m
-    sigma2 = spread2 / np.maximum(count.reshape(H, W), 1) + SIGMA_MIN_M**2 + (SLOPE_SHARE * rise_m) ** 2
+    # Stage 3: what the neighbours say, by tiles: the sums of a pixel's plane take 200 bytes. Arrays that are there
+    # already become those of the answer.
+    height_m, sigma_m, obstacle_m = (each.reshape(H, W) for each in (height, variance, obstacle))
+    for metres in (height_m, obstacle_m):
+        metres /= 1e3
+    obstacle_m[np.isnan(height_m)] = np.nan
+    slope, roughness, step = (np.empty((H, W)) for _ in range(3))
+    for tile, bordered, inner in _tiles(H, W):
+        around = _around(height_m[bordered], geometry.voxel_edge_m)
+        for whole, part in zip((slope, roughness, step), around, strict=True):
+            whole[tile] = part[inner]
+        spread2 = sigma_m[tile] / 1e6 + (VOTE_SPREAD * step_mm / 1e3) ** 2
+        rise_m = np.nan_to_num(np.tan(slope[tile])) * geometry.voxel_edge_m
+        votes_of = np.maximum(count.reshape(H, W)[tile], 1)
+        sigma_m[tile] = np.sqrt(spread2 / votes_of + SIGMA_MIN_M**2 + (SLOPE_SHARE * rise_m) ** 2)
     x, y = ((int(number) * 2 + 1) * geometry.voxel_edge_um / 2e6 for number in low[:2])
     return Elevation(
         height_m=height_m,
-        sigma_m=np.sqrt(sigma2),
+        sigma_m=sigma_m,
         votes=count.reshape(H, W),
         slope_rad=slope,
         roughness_m=roughness,
         step_m=step,
-        obstacle_m=np.where(np.isnan(height_m), np.nan, obstacle.reshape(H, W) / 1e3),
+        obstacle_m=obstacle_m,
         origin_m=(x, y),
         edge_m=geometry.voxel_edge_m,
     )
@@ -185,6 +201,19 @@ def _voxels(
         np.concatenate([each[3] for each in found]),
         np.concatenate([each[4] for each in found]),
     )
+
+
+def _tiles(H: int, W: int) -> Iterator[tuple[Part, Part, Part]]:
+    """Tiles of an image; each with the part that has its neighbours, too, and its own place in that part."""
+    columns = min(max(W, 1), TILE_PIXELS)
+    rows = max(1, TILE_PIXELS // columns)
+    for y, x in itertools.product(range(0, H, rows), range(0, W, columns)):
+        top, left = max(y - 1, 0), max(x - 1, 0)
+        yield (
+            (slice(y, y + rows), slice(x, x + columns)),
+            (slice(top, y + rows + 1), slice(left, x + columns + 1)),
+            (slice(y - top, y - top + rows), slice(x - left, x - left + columns)),
+        )
 
 
 def _around(height_m: Floats, edge_m: float) -> tuple[Floats, Floats, Floats]:

@@ -154,7 +154,7 @@ def check_evidence(meta: CommitMeta, cell: CanonicalCell, tops: npt.NDArray[np.i
     if meta.commit_id.author.robot == INITIAL:
         return
     scans = max(1, len(meta.scans))
-    complaint = _excess(cell.content, cell.geometry, tops, scans, cameras=max(1, len(meta.sensors)))
+    complaint = _excess(cell.content, cell.geometry, tops, scans, cameras=max(1, len(set(meta.sensors))))
     if complaint:
         raise BadInputError("too_much_evidence", f"cell {cell_of_key(cell.key)}: {complaint} from {scans} scans")
 
