@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     )
     from cairn_map.evidence.grid import Geometry, geometry_for, level_geometry
     from cairn_map.evidence.inverse_sensor_model import SensorModel
-    from cairn_map.queries.layered_snapshot import LayeredSnapshot
+    from cairn_map.queries.layers.layered_snapshot import LayeredSnapshot
     from cairn_map.queries.level.elevation import Elevation, Vehicle
     from cairn_map.queries.map_snapshot import MapSnapshot
     from cairn_map.queries.mark_groups import MarkGroup, group_marks
@@ -115,7 +115,7 @@ _MODULES = {
     """,
     "cairn_map.evidence.grid": "Geometry geometry_for level_geometry",
     "cairn_map.evidence.inverse_sensor_model": "SensorModel",
-    "cairn_map.queries.layered_snapshot": "LayeredSnapshot",
+    "cairn_map.queries.layers.layered_snapshot": "LayeredSnapshot",
     "cairn_map.queries.level.elevation": "Elevation Vehicle",
     "cairn_map.queries.map_snapshot": "MapSnapshot",
     "cairn_map.queries.mark_groups": "MarkGroup group_marks",

@@ -33,7 +33,15 @@ def map_gone(gone: GoneMap) -> NotFoundError:
 
 
 def no_map(name: str) -> NotFoundError:
-    """Error for a name that no map has or had."""
+    """Error for a name that no map, or no layer of a map, has or had."""
+    whole = map_of_layer(name)
+    if whole is not None:
+        layer = name.partition(".")[2]
+        return NotFoundError(
+            "no_map",
+            f"there is no layer {layer!r} of map {whole}; `cairn map layer list` lists them, and `cairn map layer add` "
+            "adds one",
+        )
     return NotFoundError("no_map", f"there is no map {name!r}; `cairn map ls` lists them")
 
 

@@ -26,7 +26,7 @@ from cairn_map.evidence.grid import CellKey, cell_of_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.files.cell_folder import MAP_FILE, cell_path, read_cells, read_head
 from cairn_map.machine_memory import standard_limit_bytes
-from cairn_map.queries.layered_snapshot import LayeredSnapshot
+from cairn_map.queries.layers.layered_snapshot import LayeredSnapshot
 from cairn_map.queries.map_snapshot import MapSnapshot, snapshot_at, snapshot_of
 from cairn_map.render.map_picture import Ages
 from cairn_map.wire.messages import MapInfo
@@ -108,7 +108,7 @@ def layers_part(
     """The cells of all layers that a question needs, or (None) all; raises as `open_layers`."""
     server_url, name = split_map_url(map_url)
     with MapApi(server_url, token=token) as api:
-        layers = _layers_of(api, name)
+        layers = layers_of(api, name)
     share_bytes = (memory_bytes_max or standard_limit_bytes()) // len(layers)
     return LayeredSnapshot(
         {
@@ -118,7 +118,7 @@ def layers_part(
     )
 
 
-def _layers_of(api: MapApi, name: str) -> dict[str, str]:
+def layers_of(api: MapApi, name: str) -> dict[str, str]:
     """Name of each layer of a map, and the one that it is asked for by."""
     try:
         return {layer.name: layer.map for layer in api.layers(name)}

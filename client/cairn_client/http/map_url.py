@@ -2,7 +2,8 @@
 
 from urllib.parse import urlsplit
 
-from cairn_map.commits.ids import map_name
+from cairn_map.commits.ids import map_name, map_of_layer
+from cairn_map.epochs.layer import EVIDENCE
 from cairn_map.errors import BadInputError
 
 
@@ -21,3 +22,15 @@ def split_map_url(map_url: str) -> tuple[str, str]:
     if parts.scheme not in ("http", "https") or not is_host or not name or "/" in name:
         raise BadInputError("bad_url", f"a map's URL is http://HOST:PORT/maps/NAME, got {map_url[:200]!r}")
     return f"{parts.scheme}://{parts.netloc}{head}", map_name(name)
+
+
+def layer_url(map_url: str, layer: str) -> str:
+    """URL of a layer of a map, by the map's URL; that of `evidence` is the map's own.
+
+    Raises:
+        BadInputError: kind `bad_option`: the URL is that of a layer already; or it is none, or the name cannot be.
+    """
+    server_url, name = split_map_url(map_url)
+    if map_of_layer(name) is not None:
+        raise BadInputError("bad_option", f"{map_url} has one layer: to name another, take the map's own URL")
+    return f"{server_url}/maps/{name if layer == EVIDENCE else map_name(f'{name}.{layer}')}"

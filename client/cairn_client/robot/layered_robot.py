@@ -37,7 +37,7 @@ from cairn_map.commits.ids import map_of_layer, robot_name
 from cairn_map.epochs.layer import EVIDENCE
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.inverse_sensor_model import SensorModel
-from cairn_map.queries.layered_snapshot import LayeredSnapshot
+from cairn_map.queries.layers.layered_snapshot import LayeredSnapshot
 
 NO_INTEGRATORS: Mapping[str, Integrator] = {}
 

@@ -5,6 +5,7 @@ import io
 import numpy as np
 import numpy.typing as npt
 
+from cairn_map.arrays import Floats
 from cairn_map.codec.view_code import encode_view
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.channels import ChannelKind, class_colours
@@ -46,7 +47,7 @@ def cell_file(
     return (ply_file(voxels) if suffix == "ply" else npz_file(voxels)), MEDIA_TYPES[suffix]
 
 
-def ply_file(voxels: Voxels) -> bytes:
+def ply_file(voxels: Voxels, *, edges_m: Floats | None = None) -> bytes:
     """Voxel centres as a binary little-endian PLY point cloud.
 
     Properties: x y z (float, metres, map frame), red green blue (uchar), probability (float), temperature (float,
@@ -54,6 +55,10 @@ def ply_file(voxels: Voxels) -> bytes:
     temperature and intensity `_measured_s` (double, UTC seconds since 1970, NaN where unknown). Of a channel of classes
     `class` (short, its number, -1 without votes) and `unsure` (uchar, 1 where it leads by less than two votes); a
     comment for each class gives its number and its name.
+
+    Args:
+        voxels: the voxels.
+        edges_m: (N,) their edges, metres, for the property `edge` (float) of voxels of several layers; None: without.
     """
     N = len(voxels)
     fields: list[tuple[str, str]] = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
@@ -64,6 +69,7 @@ def ply_file(voxels: Voxels) -> bytes:
     fields += [(name, "<f8") for name in times]
     classes = voxels.of_kind(ChannelKind.CLASSES)
     fields += [("class", "<i2"), ("unsure", "u1")] if classes else []
+    fields += [] if edges_m is None else [("edge", "<f4")]
     table = np.zeros(N, np.dtype(fields))
     for axis, name in enumerate("xyz"):
         table[name] = voxels.centres_m[:, axis]
@@ -80,6 +86,8 @@ def ply_file(voxels: Voxels) -> bytes:
     if classes is not None and classes.unsure is not None:
         table["class"] = np.nan_to_num(classes.mean, nan=-1)
         table["unsure"] = classes.unsure
+    if edges_m is not None:
+        table["edge"] = edges_m
     words = {"<f4": "float", "<f8": "double", "u1": "uchar", "<i4": "int", "<i2": "short"}
     names = classes.channel.classes if classes else ()
     head = ["ply", "format binary_little_endian 1.0", "comment cairn; metres, map frame; kelvin"]
@@ -88,9 +96,14 @@ def ply_file(voxels: Voxels) -> bytes:
     return "\n".join(head).encode() + table.tobytes()
 
 
-def npz_file(voxels: Voxels) -> bytes:
+def npz_file(voxels: Voxels, *, layers: npt.NDArray[np.str_] | None = None, edges_m: Floats | None = None) -> bytes:
     """Voxels as a compressed NPZ: numbers, centres_m, counts, probability, and per channel mean, weight, spread,
     and of a dated reading measured_s; of a channel of classes the mean is a number in `names`, and there is unsure.
+
+    Args:
+        voxels: the voxels.
+        layers: (N,) names of their layers, in whose grids the numbers are, for the array `layer`; None: of one.
+        edges_m: (N,) their edges, metres, for the array `edge_m`; None: without.
     """
     arrays: dict[str, npt.NDArray[np.generic]] = {
         "numbers": voxels.numbers,
@@ -98,6 +111,8 @@ def npz_file(voxels: Voxels) -> bytes:
         "counts": voxels.counts,
         "probability": voxels.probability,
     }
+    arrays |= {} if layers is None else {"layer": layers}
+    arrays |= {} if edges_m is None else {"edge_m": edges_m}
     for name, reading in voxels.readings.items():
         arrays[f"{name}_mean"], arrays[f"{name}_weight"] = reading.mean, reading.weight
         if reading.spread is not None:

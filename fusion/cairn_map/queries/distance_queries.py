@@ -65,7 +65,7 @@ def cast(
     ends = RayEnds(np.empty(N), np.empty(N, np.uint8), np.empty((N, 3), np.int64), np.full((N, 3), np.nan))
     for start in range(0, N, CHUNK):
         part = slice(start, start + CHUNK)
-        units = _units(directions[part])
+        units = units_of(directions[part])
         inside = cast_into(
             frozen.grid,
             origins[part],
@@ -107,7 +107,7 @@ def _as_many(origins: Floats, directions: Floats) -> tuple[Floats, Floats]:
     return next(repeated), next(repeated)
 
 
-def _units(directions: Floats) -> Floats:
+def units_of(directions: Floats) -> Floats:
     """The same directions with length 1.
 
     Raises:

@@ -11,7 +11,7 @@ from tests.fixtures.client.made import GEOMETRY, MAP, seen
 from tests.fixtures.client.robot_program import RIG
 from tests.fixtures.commands import cairn
 
-from cairn_client.folders.map_folder import _layers_of, open_layers, open_map
+from cairn_client.folders.map_folder import layers_of, open_layers, open_map
 from cairn_client.http.api import MapApi
 from cairn_client.robot.robot import Robot
 from cairn_fusion.recording.scan import Scan
@@ -95,12 +95,62 @@ def test_points_are_read_in_the_finest_layer_that_knows_them(server: LiveServer,
             State(state).name.lower() for state in layers[name].state_at(points)
         ]
         assert name == "evidence" or asked(url) == alone
-    assert "no layer 'far'" in cairn(
-        *("map", "query", server.map_url, "points", "0,0,0", "--layer", "far"), folder=tmp_path, code=3
-    )
+    said = cairn(*("map", "query", server.map_url, "points", "0,0,0", "--layer", "far"), folder=tmp_path, code=3)
+    assert "no layer 'far' of map" in said
+    assert "cairn map layer add" in said
     assert "take the map's own URL" in cairn(
         *("map", "query", f"{server.map_url}.fine", "points", "0,0,0", "--layer", "far"), folder=tmp_path, code=1
     )
+
+
+def test_rays_slices_and_files_are_of_the_finest_layer_that_knows_each_place(
+    server: LiveServer, tmp_path: Path
+) -> None:
+    cairn("map", "layer", "add", server.map_url, "fine", "--voxel", "0.01", folder=tmp_path)
+    for name, url, places in (("far", server.map_url, (0, 9, 300)), ("near", f"{server.map_url}.fine", (1, 2, 70))):
+        with Robot(None, url, directory=tmp_path / name, name=name) as robot:
+            robot.replica.commit({cell_key((0, 0, 0)): seen(*places, kelvin_steps=9)})
+            robot.sync(until_folded=True)
+    layers = open_layers(server.map_url)
+
+    def asked(*words: str) -> Any:
+        return json.loads(cairn("map", "query", server.map_url, *words, "--json", folder=tmp_path))
+
+    x, y, _ = layers["fine"].occupied_in().centres_m[0].tolist()
+    origin, way = [x, y, -1.0], [0.0, 0.0, 1.0]
+    texts = [",".join(map(str, each)) for each in (origin, way)]
+    ends = layers.cast_rays([origin], [way], max_range_m=9.0)
+    found = asked("ray", *texts)
+    assert (found["hit"], found["layer"]) == (bool(ends.hit[0]), ends.names[0])
+    assert found["distance_m"] == pytest.approx(float(ends.distance_m[0]))
+    alone = asked("ray", *texts, "--layer", "evidence")
+    assert ("layer" in alone, "voxel" in alone) == (False, True)
+    nearest = layers.nearest_occupied([origin], radius_m=5.0)
+    (found,) = asked("nearest", texts[0])
+    assert (found["layer"], found["distance_m"]) == (nearest.names[0], pytest.approx(float(nearest.distance_m[0])))
+    assert "layer" not in asked("nearest", texts[0], "--unknown")[0]
+    box = "--box=0,0,0,0.1,0.1,0.1"
+    assert asked("slice", "0.005", box)["edge_m"] == asked("height", box)["edge_m"] == 0.01
+    assert asked("slice", "0.005", box, "--layer", "evidence")["edge_m"] == 0.05
+
+    # Files of the whole map have each place once, and say how large it is; a layer alone is as it was.
+    ply, npz, one = (tmp_path / name for name in ("m.ply", "m.npz", "one.ply"))
+    said = cairn("map", "export", server.map_url, "--ply", str(ply), "--npz", str(npz), folder=tmp_path)
+    occupied = {name: len(voxels) for name, voxels in layers.occupied_in().items()}
+    for name, count in occupied.items():
+        assert f"  layer {name}: {count} voxels" in said
+    head = ply.read_bytes().partition(b"end_header")[0].decode()
+    assert f"element vertex {sum(occupied.values())}\n" in head
+    assert "property float edge\n" in head
+    with np.load(npz) as arrays:
+        assert {*zip(arrays["layer"].tolist(), arrays["edge_m"].tolist(), strict=True)} == {
+            ("evidence", 0.05),
+            ("fine", 0.01),
+        }
+        assert len(arrays["temperature_mean"]) == len(arrays["layer"])
+    cairn("map", "export", server.map_url, "--ply", str(one), "--layer", "fine", folder=tmp_path)
+    head = one.read_bytes().partition(b"end_header")[0].decode()
+    assert (f"element vertex {len(layers['fine'].occupied_in())}\n" in head, "edge" in head) == (True, False)
 
 
 def test_a_server_of_before_has_maps_of_one_layer() -> None:
@@ -108,7 +158,7 @@ def test_a_server_of_before_has_maps_of_one_layer() -> None:
         def layers(self, name: str) -> None:
             raise NotFoundError("no_route", "Not Found")
 
-    assert _layers_of(Before(), "lab") == {"evidence": "lab"}  # type: ignore[arg-type]
+    assert layers_of(Before(), "lab") == {"evidence": "lab"}  # type: ignore[arg-type]
 
 
 def test_what_is_no_layer_is_refused_with_the_next_step(server: LiveServer, tmp_path: Path) -> None:

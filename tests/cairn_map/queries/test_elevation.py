@@ -14,7 +14,7 @@ from cairn_map.evidence.evidence import packed_evidence
 from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.grid import Geometry, cell_key, level_geometry
 from cairn_map.queries import region_queries
-from cairn_map.queries.layered_snapshot import LayeredSnapshot
+from cairn_map.queries.layers.layered_snapshot import LayeredSnapshot
 from cairn_map.queries.level import elevation
 from cairn_map.queries.level.elevation import Elevation, Vehicle
 from cairn_map.queries.map_snapshot import MapSnapshot, snapshot_of

@@ -11,6 +11,12 @@ A storey as a ground robot sees it, for Nav2's map server; without --ground the 
 
     $ cairn map export http://127.0.0.1:8750/maps/lab --map-server floor1 --band 0.1,1.5
     floor1.pgm, floor1.yaml: 640 x 512 pixels of 4 cm, ground at 0.00 m, 96.1 m2 free, 12.4 m2 occupied
+
+Of a map with layers (`cairn map layer`) --ply and --npz of the whole map have the voxels of all of them, each place in
+the finest layer that shows it, with the edge of each voxel; everything else is of the map's first layer. --layer NAME,
+or the layer's own URL, is one layer alone:
+
+    $ cairn map export http://127.0.0.1:8750/maps/lab --ply fine.ply --layer fine
 """
 
 import argparse
@@ -34,10 +40,12 @@ from cairn_client.cli.arguments import (
     shown_length,
 )
 from cairn_client.cli.floor_arguments import add_floor_arguments, asked_ground
-from cairn_client.folders.map_folder import open_map
+from cairn_client.folders.map_folder import layers_of, open_layers, open_map
 from cairn_client.http.api import MapApi
 from cairn_client.http.http_link import cells_with_evidence, download_cell
+from cairn_client.http.map_url import layer_url
 from cairn_map.codec.history_code import DecodedHistory
+from cairn_map.commits.ids import map_of_layer
 from cairn_map.epochs.epoch import Epoch
 from cairn_map.epochs.present import shown_evidence
 from cairn_map.errors import BadInputError, NotFoundError, first_error
@@ -48,6 +56,8 @@ from cairn_map.files.cell_folder import FolderHead, write_cell, write_head
 from cairn_map.files.export_request import ExportRequest
 from cairn_map.machine_memory import standard_limit_bytes
 from cairn_map.progress import with_progress
+from cairn_map.queries.layers.finest_voxels import joined_layers
+from cairn_map.queries.layers.layered_snapshot import LayeredSnapshot
 from cairn_map.render.map_server import map_files, write_map_files
 from cairn_map.wire.messages import MapInfo
 
@@ -82,6 +92,9 @@ def add_export_parser(commands: Subparsers) -> None:
         "--map-server", type=Path, metavar="NAME", help="a storey's floor for Nav2's map server: NAME.pgm and NAME.yaml"
     )
     add_floor_arguments(export)
+    export.add_argument(
+        "--layer", metavar="NAME", help="only this layer of the map (for --ply and --npz of the whole map, the finest)"
+    )
     add_at(export)
     _add_part_arguments(export)
 
@@ -141,6 +154,8 @@ def _get(args: argparse.Namespace) -> int:
 
 def _export(args: argparse.Namespace) -> int:
     """Download all cells, and write the files that the options name."""
+    if args.layer is not None:
+        args.map = layer_url(args.map, args.layer)
     if args.map_server is not None:
         return _export_floor(args)
     if args.ground is not None or args.band is not None:
@@ -161,6 +176,11 @@ def _export(args: argparse.Namespace) -> int:
     _check_outputs(args.ply, args.npz, args.picture)
     api, name = api_of(args.map, args.token)
     with api:
+        if (args.ply or args.npz) and _has_layers(api, name, args):
+            _write_finest(open_layers(args.map, token=args.token.of(args.map), at_s=seconds_of(args.at)), args)
+            args.ply = args.npz = None
+            if not (args.cells or args.picture):
+                return 0
         info = api.map_info(name)
         if args.cells:
             head = FolderHead(geometry=info.geometry, sensor_model=info.sensor_model, epoch_s=info.epoch_s)
@@ -185,6 +205,33 @@ def _export(args: argparse.Namespace) -> int:
             write_map_picture(args.picture, occupied, voxel_edge_m=edge_m, ceiling_m=args.ceiling)
             say(f"{args.picture}: {len(occupied)} occupied voxels")
     return 0
+
+
+def _has_layers(api: MapApi, name: str, args: argparse.Namespace) -> bool:
+    """True if voxels of several layers are asked for."""
+    return args.layer is None and map_of_layer(name) is None and len(layers_of(api, name)) > 1
+
+
+def _write_finest(layers: LayeredSnapshot, args: argparse.Namespace) -> None:
+    """Write --ply and --npz of all layers together.
+
+    Raises:
+        NotFoundError: kind `empty_map`.
+    """
+    for path, form in ((args.ply, "ply"), (args.npz, "npz")):
+        if path is None:
+            continue
+        found = layers.occupied_in() if form == "ply" else layers.voxels_in()
+        lengths = [len(voxels) for voxels in found.values()]
+        if form == "npz" and not sum(lengths):
+            raise NotFoundError("empty_map", f"no layer of {args.map} holds anything yet")
+        edges_m = np.repeat([layers[name].geometry.voxel_edge_m for name in found], lengths)
+        voxels = joined_layers(list(found.values()))
+        names = np.repeat(np.array(list(found)), lengths)
+        is_ply = form == "ply"
+        data = ply_file(voxels, edges_m=edges_m) if is_ply else npz_file(voxels, layers=names, edges_m=edges_m)
+        _write(path, data)
+        say("\n".join(f"  layer {name}: {count} voxels" for name, count in zip(found, lengths, strict=True)))
 
 
 def _export_floor(args: argparse.Namespace) -> int:

@@ -19,9 +19,10 @@ and --at with `hottest`; else the server itself finds the hottest. All lengths a
 temperatures degrees Celsius here and kelvin in JSON; unknown values are `-`, in JSON null. Of a map with epochs, points
 have the time at which they were seen last, too, and readings the count of their samples and the time of the newest: the
 beginning of its epoch, UTC.
-Of a map with layers (`cairn map layer`) each point is read in the finest layer that knows it, which is named; all other
-questions are asked of one layer: of the map's URL its first one, of MAP.LAYER that one. In a layer of classes points
-have the class with the most votes, marked as unsure where it leads by less than two; in JSON `mean` is its number.
+Of a map with layers (`cairn map layer`) points, rays, nearest voxels, slices and heights are answered by the finest
+layer that knows each place, which is named; the hottest voxels and --unknown are of its first one, the elevation is of
+a level. --layer NAME asks one layer, as does its URL, MAP.LAYER. In a layer of classes points have the class with the
+most votes, marked as unsure where it leads by less than two; in JSON `mean` is its number.
 --json prints JSON for programs; `slice` and `height` then give all pixels, rows along y and columns along x.
 """
 
@@ -41,13 +42,16 @@ from cairn_client.cli.arguments import Subparsers, add_at, add_token, api_of, sa
 from cairn_client.cli.robot_arguments import box, place
 from cairn_client.folders.map_folder import layers_part, open_map, open_part
 from cairn_client.folders.needed_cells import Needs, along_ray, near_points
-from cairn_client.http.map_url import split_map_url
+from cairn_client.http.map_url import layer_url, split_map_url
 from cairn_map.arrays import Floats
 from cairn_map.commits.ids import map_of_layer
 from cairn_map.epochs.layer import EVIDENCE
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.voxels import Reading
+from cairn_map.queries.distance_queries import Nearest, RayEnds
+from cairn_map.queries.layers.layered_rays import LayeredEnds
+from cairn_map.queries.layers.layered_snapshot import LayeredSnapshot
 from cairn_map.queries.level.elevation import CLEARANCE_M, Vehicle
 from cairn_map.queries.map_snapshot import MapSnapshot
 from cairn_map.queries.occupancy_states import State
@@ -66,6 +70,8 @@ NOTHING_HOT = "no occupied voxel has a temperature"
 SIGNS = {State.UNKNOWN: " ", State.FREE: ".", State.OCCUPIED: "#"}
 Answer = Callable[[MapSnapshot, argparse.Namespace], tuple[Any, list[str]]]
 """Answer to a question, as JSON and as lines for people."""
+LayeredAnswer = Callable[[LayeredSnapshot, argparse.Namespace], tuple[Any, list[str]]]
+"""Answer of all layers of a map together."""
 Needed = Callable[[argparse.Namespace], Needs | None]
 """Cells of a server's map that a question needs; None: all."""
 
@@ -80,31 +86,34 @@ def add_parser(commands: Subparsers) -> None:
     query.set_defaults(run=_run)
     questions = query.add_subparsers(required=True, metavar="QUESTION")
 
-    def question(name: str, text: str, answer: Answer, needs: Needed = _all) -> argparse.ArgumentParser:
+    def question(
+        name: str, text: str, answer: Answer, needs: Needed = _all, layered: LayeredAnswer | None = None
+    ) -> argparse.ArgumentParser:
         added = questions.add_parser(name, help=text, description=text)
         added.add_argument("--json", action="store_true", help="print JSON")
-        added.set_defaults(answer=answer, needs=needs)
+        whole = "the first" if layered is None else "the finest that knows each place"
+        added.add_argument("--layer", metavar="NAME", help=f"only this layer of the map ({whole})")
+        added.set_defaults(answer=answer, needs=needs, layered=layered)
         return added
 
-    points = question("points", "state, probability and readings at points", _points, _at_points)
+    points = question("points", "state, probability and readings at points", _points, _at_points, _points_of_layers)
     points.add_argument("points", nargs="+", type=place, metavar="X,Y,Z", help="metres, map frame")
-    points.add_argument("--layer", metavar="NAME", help="only this layer of the map (of each point the finest known)")
-    ray = question("ray", "the first occupied voxel along a ray", _ray, _on_ray)
+    ray = question("ray", "the first occupied voxel along a ray", _ray, _on_ray, _ray_of_layers)
     ray.add_argument("origin", type=place, metavar="X,Y,Z", help="metres, map frame")
     ray.add_argument("direction", type=place, metavar="DX,DY,DZ", help="direction, of any length")
     ray.add_argument(
         "--range", type=float, default=math.inf, metavar="METRES", help="longest distance (as far as the map goes)"
     )
-    nearest = question("nearest", "the nearest occupied voxel of points", _nearest, _within_radius)
+    nearest = question("nearest", "the nearest occupied voxel of points", _nearest, _within_radius, _nearest_of_layers)
     nearest.add_argument("points", nargs="+", type=place, metavar="X,Y,Z", help="metres, map frame")
     nearest.add_argument("--radius", type=float, default=5.0, metavar="METRES", help="longest distance (5)")
     nearest.add_argument("--unknown", action="store_true", help="the nearest unknown voxel instead")
     hottest = question("hottest", "the occupied voxels with the highest temperature", _hottest)
     hottest.add_argument("--count", type=int, default=10, help="how many (10)")
-    layer = question("slice", "the horizontal layer of voxels at a height", _slice)
+    layer = question("slice", "the horizontal layer of voxels at a height", _slice, layered=_slice)
     layer.add_argument("z", type=float, metavar="Z", help="metres, map frame")
     layer.add_argument("--what", default="state", help="state, probability, log_odds or a channel's name (state)")
-    height = question("height", "the highest occupied surface of each column", _height)
+    height = question("height", "the highest occupied surface of each column", _height, layered=_height)
     elevation = question("elevation", "the surface of a level layer: heights, slopes, steps, obstacles", _elevation)
     elevation.add_argument("--png", type=Path, metavar="FILE", help="picture: green easy, red hard, dark red too much")
     elevation.add_argument("--npz", type=Path, metavar="FILE", help="all of it as NumPy arrays")
@@ -120,12 +129,14 @@ def add_parser(commands: Subparsers) -> None:
 def _run(args: argparse.Namespace) -> int:
     answer: Answer = args.answer
     is_server = "://" in args.map
+    if args.layer is not None:
+        if not is_server:
+            raise BadInputError("bad_option", f"{args.map} has one layer: for --layer take the map's own URL")
+        args.map = layer_url(args.map, args.layer)
     if is_server and answer is _hottest and args.at is None:
         found, lines = _hottest_of_server(args)
-    elif is_server and answer is _points and map_of_layer(split_map_url(args.map)[1]) is None:
-        found, lines = _points_of_layers(args)
-    elif answer is _points and args.layer is not None:
-        raise BadInputError("bad_option", f"{args.map} has one layer: for --layer take the map's own URL")
+    elif is_server and args.layer is None and map_of_layer(split_map_url(args.map)[1]) is None and _is_layered(args):
+        found, lines = _of_layers(args)
     else:
         found, lines = answer(_opened(args) if is_server else open_map(args.map, at_s=seconds_of(args.at)), args)
     for line in [json.dumps(found)] if args.json else lines:
@@ -140,6 +151,22 @@ def _opened(args: argparse.Namespace) -> MapSnapshot:
     if needs is None:
         return open_map(args.map, token=token, at_s=at_s)
     return open_part(args.map, needs, token=token, at_s=at_s)
+
+
+def _is_layered(args: argparse.Namespace) -> bool:
+    """True if all layers of a map can answer together."""
+    return args.layered is not None and not (args.answer is _nearest and args.unknown)
+
+
+def _of_layers(args: argparse.Namespace) -> tuple[Any, list[str]]:
+    """Answer of a server's map: of all its layers where it has several."""
+    token, at_s = args.token.of(args.map), seconds_of(args.at)
+    layers = layers_part(args.map, args.needs(args), token=token, at_s=at_s)
+    if len(layers.names) == 1:
+        answer: Answer = args.answer
+        return answer(layers[EVIDENCE], args)
+    layered: LayeredAnswer = args.layered
+    return layered(layers, args)
 
 
 def _all(args: argparse.Namespace) -> None:
@@ -184,14 +211,8 @@ def _points(snapshot: MapSnapshot, args: argparse.Namespace) -> tuple[Any, list[
     return found, lines
 
 
-def _points_of_layers(args: argparse.Namespace) -> tuple[Any, list[str]]:
-    """`_points` of a server's map, of each point in the finest layer that knows it, or in the one asked for."""
-    token, at_s = args.token.of(args.map), seconds_of(args.at)
-    layers = layers_part(args.map, _at_points(args), token=token, at_s=at_s)
-    if args.layer is not None:
-        return _points(layers[args.layer], args)
-    if len(layers.names) == 1:
-        return _points(layers[EVIDENCE], args)
+def _points_of_layers(layers: LayeredSnapshot, args: argparse.Namespace) -> tuple[Any, list[str]]:
+    """`_points`, of each point in the finest layer that knows it."""
     # What no layer knows is said of the one that the map began with.
     of_layer: dict[str, list[int]] = {name: [] for name in layers.names}
     for n, name in enumerate(layers.names_at(args.points)):
@@ -211,19 +232,45 @@ def _points_of_layers(args: argparse.Namespace) -> tuple[Any, list[str]]:
 
 def _ray(snapshot: MapSnapshot, args: argparse.Namespace) -> tuple[Any, list[str]]:
     ends = snapshot.cast_rays([args.origin], [args.direction], max_range_m=args.range)
+    return _end_of_ray(ends, args, {"voxel": ends.voxels[0].tolist() if ends.hit[0] else None})
+
+
+def _ray_of_layers(layers: LayeredSnapshot, args: argparse.Namespace) -> tuple[Any, list[str]]:
+    """`_ray`, through each place as the finest layer that knows it has it."""
+    ends = layers.cast_rays([args.origin], [args.direction], max_range_m=args.range)
+    return _end_of_ray(ends, args, {"layer": ends.names[0]})
+
+
+def _end_of_ray(ends: RayEnds | LayeredEnds, args: argparse.Namespace, where: dict[str, Any]) -> tuple[Any, list[str]]:
+    """The end of one ray, with what says where it is: its voxel, or its layer."""
     if not ends.hit[0]:
         far = "as far as the map goes" if math.isinf(args.range) else f"within {args.range:g} m"
-        return {"hit": False, "distance_m": None, "voxel": None, "point_m": None}, [f"nothing is in the way {far}"]
-    distance_m, voxel, point_m = float(ends.distance_m[0]), ends.voxels[0].tolist(), ends.points_m[0].tolist()
+        return {"hit": False, "distance_m": None, **where, "point_m": None}, [f"nothing is in the way {far}"]
+    distance_m, point_m = float(ends.distance_m[0]), ends.points_m[0].tolist()
     place = ", ".join(f"{value:.3f}" for value in point_m)
-    found = {"hit": True, "distance_m": distance_m, "voxel": voxel, "point_m": point_m}
-    return found, [f"occupied after {distance_m:.3f} m, at ({place})"]
+    found = {"hit": True, "distance_m": distance_m, **where, "point_m": point_m}
+    of_layer = f", layer {where['layer']}" if "layer" in where else ""
+    return found, [f"occupied after {distance_m:.3f} m, at ({place}){of_layer}"]
 
 
 def _nearest(snapshot: MapSnapshot, args: argparse.Namespace) -> tuple[Any, list[str]]:
     ask = snapshot.nearest_unknown if args.unknown else snapshot.nearest_occupied
     what = "unknown" if args.unknown else "occupied"
-    nearest = ask(args.points, radius_m=args.radius)
+    return _nearest_of(ask(args.points, radius_m=args.radius), args, what)
+
+
+def _nearest_of_layers(layers: LayeredSnapshot, args: argparse.Namespace) -> tuple[Any, list[str]]:
+    """`_nearest`, of the occupied voxels of all layers."""
+    nearest = layers.nearest_occupied(args.points, radius_m=args.radius)
+    found, lines = _nearest_of(nearest, args, "occupied")
+    found = [{**each, "layer": name} for each, name in zip(found, nearest.names, strict=True)]
+    said = zip(lines, nearest.names, strict=True)
+    return found, [f"{line}, layer {name}" if name is not None else line for line, name in said]
+
+
+def _nearest_of(
+    nearest: Nearest | LayeredEnds, args: argparse.Namespace, what: str
+) -> tuple[list[dict[str, Any]], list[str]]:
     found, lines = [], []
     asked = zip(args.points, nearest.distance_m.tolist(), nearest.points_m.tolist(), strict=True)
     for (x, y, z), distance_m, nearest_m in asked:
@@ -267,13 +314,13 @@ def _hottest_of_server(args: argparse.Namespace) -> tuple[Any, list[str]]:
     return [voxel.model_dump(mode="json") for voxel in answer.voxels], lines
 
 
-def _slice(snapshot: MapSnapshot, args: argparse.Namespace) -> tuple[Any, list[str]]:
+def _slice(snapshot: MapSnapshot | LayeredSnapshot, args: argparse.Namespace) -> tuple[Any, list[str]]:
     image = snapshot.layer_at(args.z, args.what, box_m=_corners(args))
     drawn = _drawn(image.values) if args.what == "state" else _span(image.values, args.what)
     return _image_json(image), [_image_head(image), *drawn]
 
 
-def _height(snapshot: MapSnapshot, args: argparse.Namespace) -> tuple[Any, list[str]]:
+def _height(snapshot: MapSnapshot | LayeredSnapshot, args: argparse.Namespace) -> tuple[Any, list[str]]:
     image = snapshot.height_map(box_m=_corners(args))
     return _image_json(image), [_image_head(image), *_span(image.values, "height in m")]
 

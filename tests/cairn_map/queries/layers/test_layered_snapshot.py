@@ -9,7 +9,7 @@ from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import BadInputError, NotFoundError
 from cairn_map.evidence.channels import COLOUR, TEMPERATURE, Channel, ChannelKind
 from cairn_map.evidence.grid import Geometry, cell_key
-from cairn_map.queries.layered_snapshot import LayeredSnapshot
+from cairn_map.queries.layers.layered_snapshot import LayeredSnapshot
 from cairn_map.queries.map_snapshot import MapSnapshot, snapshot_of
 from cairn_map.queries.occupancy_states import State
 

@@ -1,0 +1,246 @@
+"""Rays, distances, images and sets of voxels of several layers: as slow readers of all their voxels find them."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from tests.fixtures.map.made import random_evidence
+
+from cairn_map.epochs.history_map import HistoryMap
+from cairn_map.epochs.layer import MapLayer
+from cairn_map.errors import BadInputError
+from cairn_map.evidence.channels import COLOUR, TEMPERATURE
+from cairn_map.evidence.evidence import Evidence, packed_evidence
+from cairn_map.evidence.grid import CellKey, Geometry, cell_key, level_geometry, split_voxels
+from cairn_map.queries.layers.finest_voxels import joined_layers
+from cairn_map.queries.layers.layered_snapshot import LayeredSnapshot
+from cairn_map.queries.map_snapshot import MapSnapshot, snapshot_of
+from cairn_map.queries.occupancy_states import State
+
+Number = tuple[int, ...]
+WORLDS = {"cubes in cubes": (10_000, 40_000, 200_000), "borders apart": (30_000, 70_000), "one edge": (40_000, 40_000)}
+CELLS = np.stack(np.meshgrid(*[[-1, 0]] * 3), axis=-1).reshape(-1, 3).tolist()
+
+
+def layer(geometry: Geometry, seed: int, voxels: int = 60) -> MapSnapshot:
+    """A layer whose cell at the origin and seven more are full of anything."""
+    whole = HistoryMap(MapLayer(geometry=geometry))
+    whole.merge({cell_key(tuple(c)): random_evidence(seed + n, geometry, voxels=voxels) for n, c in enumerate(CELLS)})
+    return snapshot_of(whole)
+
+
+def world(name: str) -> LayeredSnapshot:
+    channels = ((COLOUR, TEMPERATURE), (TEMPERATURE,), (COLOUR,))
+    return LayeredSnapshot(
+        {
+            f"at_{n}_{edge_um}": layer(Geometry(voxel_edge_um=edge_um, depth=3, channels=channels[n]), 9 * n)
+            for n, edge_um in enumerate(WORLDS[name])
+        }
+    )
+
+
+@pytest.fixture(scope="module", params=WORLDS)
+def layers(request: pytest.FixtureRequest) -> LayeredSnapshot:
+    return world(request.param)
+
+
+def counted(geometry: Geometry, counts: dict[Number, tuple[int, int]]) -> dict[CellKey, Evidence]:
+    """Hits and misses of some voxels of the cells around the origin."""
+    cells, places = split_voxels(np.array(list(counts)), geometry)
+    found = {}
+    for cell in np.unique(cells):
+        mine = np.nonzero(cells == cell)[0]
+        mine = mine[np.argsort(places[mine])]
+        rows = np.array(list(counts.values()))[mine]
+        found[CellKey(int(cell))] = packed_evidence(places[mine], rows, np.empty((len(mine), 0), np.int64), geometry)
+    return found
+
+
+def states(snapshot: MapSnapshot) -> dict[Number, int]:
+    """State of each known voxel, by number."""
+    voxels = snapshot.voxels_in()
+    found = zip(voxels.numbers.tolist(), snapshot.state_at(voxels.centres_m).tolist(), strict=True)
+    return {tuple(number): state for number, state in found if state}
+
+
+def holder(number: Number, edge_um: int, coarse_um: int) -> Number:
+    """Coarser voxel that holds a voxel's centre."""
+    return tuple((2 * n + 1) * edge_um // (2 * coarse_um) for n in number)
+
+
+@cache
+def centres_in(i: int, edge_um: int, coarse_um: int) -> int:
+    """Finer voxels along one axis whose centres lie in a coarser one, each tried."""
+    near = range(i * coarse_um // edge_um - 2, (i + 1) * coarse_um // edge_um + 3)
+    return sum(holder((k,), edge_um, coarse_um) == (i,) for k in near)
+
+
+def naive_finest(layers: LayeredSnapshot) -> dict[str, dict[Number, int]]:
+    """Voxels that no finer layer shows: by looking at every voxel of every pair of layers."""
+    worlds = {name: states(layers[name]) for name in layers.names}
+    found = {}
+    for n, name in enumerate(layers.names):
+        coarse_um = layers[name].geometry.voxel_edge_um
+        stays = dict(worlds[name])
+        for finer in layers.names[:n]:
+            edge_um = layers[finer].geometry.voxel_edge_um
+            inside: dict[Number, list[int]] = {}
+            for number, state in worlds[finer].items():
+                inside.setdefault(holder(number, edge_um, coarse_um), []).append(state)
+            for number, state in worlds[name].items():
+                spans = [centres_in(i, edge_um, coarse_um) for i in number]
+                seen = inside.get(number, [])
+                if (seen and len(seen) == np.prod(spans)) or (state == State.OCCUPIED and State.OCCUPIED in seen):
+                    stays.pop(number, None)
+        found[name] = stays
+    return found
+
+
+def test_voxels_of_a_coarser_layer_give_way_to_what_finer_ones_show(layers: LayeredSnapshot) -> None:
+    expected = naive_finest(layers)
+    everything, occupied = layers.voxels_in(), layers.occupied_in()
+    assert tuple(everything) == layers.names
+    for name, stays in expected.items():
+        assert {tuple(number) for number in everything[name].numbers.tolist()} == stays.keys()
+        occupied_here = {number for number, state in stays.items() if state == State.OCCUPIED}
+        assert {tuple(number) for number in occupied[name].numbers.tolist()} == occupied_here
+    assert any(len(stays) < len(states(layers[name])) for name, stays in expected.items())
+    # In a box those whose centres it holds; the layers themselves are as before.
+    box = [[-0.05, -0.05, -0.05], [0.15, 0.101, 0.12]]
+    for name, voxels in layers.voxels_in(box).items():
+        inside = ((everything[name].centres_m >= box[0]) & (everything[name].centres_m <= box[1])).all(axis=1)
+        assert voxels.numbers.tolist() == everything[name].numbers[inside].tolist()
+    assert all(len(layers[name].occupied_in()) >= len(voxels) for name, voxels in occupied.items())
+
+
+def test_no_obstacle_vanishes(layers: LayeredSnapshot) -> None:
+    occupied = {name: voxels.numbers.tolist() for name, voxels in layers.occupied_in().items()}
+    for n, name in enumerate(layers.names):
+        coarse_um = layers[name].geometry.voxel_edge_um
+        shown = {
+            holder(tuple(number), layers[finer].geometry.voxel_edge_um, coarse_um)
+            for finer in layers.names[: n + 1]
+            for number in states(layers[finer])
+            if layers[finer].state_at([(np.array(number) + 0.5) * layers[finer].geometry.voxel_edge_m])[0] == 2
+        }
+        kept = {tuple(number) for number in occupied[name]}
+        assert kept <= shown
+
+
+def test_a_ray_ends_where_the_finest_layer_that_knows_the_place_has_it_occupied(layers: LayeredSnapshot) -> None:
+    rng = np.random.default_rng(5)
+    origins, ways = rng.uniform(-0.3, 0.3, (80, 3)), rng.normal(size=(80, 3))
+    ways[:6] = np.concatenate([np.eye(3), -np.eye(3)])  # along the axes, too
+    ends = layers.cast_rays(origins, ways, max_range_m=2.0)
+    units = ways / np.linalg.norm(ways, axis=1, keepdims=True)
+    along = np.arange(0, 2.0, 0.002)
+    for n in range(len(origins)):
+        met = layers.state_at(origins[n] + units[n] * along[:, None]) == State.OCCUPIED
+        before = met[along < ends.distance_m[n] - 1e-6]
+        assert not before.any()
+        if ends.hit[n]:
+            inside = ends.points_m[n] + units[n] * 2e-8
+            assert layers.state_at([inside])[0] == State.OCCUPIED
+            assert layers.names_at([inside]) == [ends.names[n]]
+            np.testing.assert_allclose(ends.points_m[n], origins[n] + units[n] * ends.distance_m[n], atol=1e-12)
+        else:
+            assert (ends.names[n], np.isnan(ends.points_m[n]).all()) == (None, True)
+    assert len({*ends.names}) > 2
+    # One layer, one origin, a range.
+    alone = LayeredSnapshot({"a": layers[layers.names[0]]})
+    mine, own = (
+        alone.cast_rays([0, 0, 0], ways, max_range_m=0.2),
+        layers[layers.names[0]].cast_rays([0, 0, 0], ways, max_range_m=0.2),
+    )
+    np.testing.assert_allclose(mine.distance_m, own.distance_m)
+
+
+def test_a_ray_passes_the_free_part_of_a_coarse_obstacle_and_ends_in_the_rest() -> None:
+    coarse, fine = (
+        HistoryMap(MapLayer(geometry=Geometry(voxel_edge_um=um, depth=3, channels=()))) for um in (100_000, 10_000)
+    )
+    coarse.merge(counted(coarse.geometry, {(1, 0, 0): (5, 0)}))
+    fine.merge(counted(fine.geometry, {(x, 0, 0): (0, 5) for x in range(0, 15)}))
+    layers = LayeredSnapshot({"fine": snapshot_of(fine), "coarse": snapshot_of(coarse)})
+    ends = layers.cast_rays([[0.005, 0.005, 0.005], [0.005, 0.055, 0.005]], [1, 0, 0], max_range_m=1.0)
+    # Up to 0.15 m the fine layer knows that row as free; above it nothing is known of the coarse voxel's part.
+    np.testing.assert_allclose(ends.distance_m, [0.145, 0.095], atol=1e-6)
+    assert ends.names == ["coarse", "coarse"]
+    assert layers.cast_rays([0.005, 0.005, 0.005], [1, 0, 0], max_range_m=0.14).hit.tolist() == [False]
+
+
+def test_the_nearest_obstacle_is_of_what_no_finer_layer_shows(layers: LayeredSnapshot) -> None:
+    points = np.random.default_rng(6).uniform(-1, 1, (50, 3))
+    shown = layers.occupied_in()
+    found = layers.nearest_occupied(points, radius_m=0.5)
+    gaps = []
+    for name, voxels in shown.items():
+        edge_m = layers[name].geometry.voxel_edge_m
+        low = voxels.numbers * edge_m
+        away = np.maximum(np.maximum(low - points[:, None], points[:, None] - (low + edge_m)), 0)
+        gaps.append(np.linalg.norm(away, axis=2).min(axis=1, initial=np.inf))
+    expected = np.min(gaps, axis=0)
+    expected[expected > 0.5] = np.inf
+    # Points count to the nanometre.
+    np.testing.assert_allclose(found.distance_m, expected, atol=2e-9)
+    assert {*found.names} >= {None}
+    np.testing.assert_allclose(
+        np.linalg.norm(found.points_m - points, axis=1)[found.hit], expected[found.hit], atol=2e-9
+    )
+
+
+def test_images_have_the_pixels_of_the_finest_layer_there(layers: LayeredSnapshot) -> None:
+    box = [[-0.2, -0.1, -0.2], [0.271, 0.251, 0.3]]
+    image = layers.layer_at(0.013, "state", box_m=box)
+    H, W = image.values.shape
+    assert image.edge_m == layers[layers.names[0]].geometry.voxel_edge_m
+    x, y = (image.origin_m[axis] + image.edge_m * np.arange(size) for axis, size in ((0, W), (1, H)))
+    assert (x[0] - image.edge_m < box[0][0] <= x[0], x[-1] <= box[1][0] < x[-1] + image.edge_m) == (True, True)
+    for row in range(H):
+        points = np.stack([x, np.full(W, y[row]), np.full(W, 0.013)], axis=1)
+        assert image.values[row].tolist() == layers.state_at(points).tolist()
+    colours = layers.layer_at(0.013, "colour", box_m=box)
+    assert colours.values.shape == (H, W, 3)
+    # The highest of what is shown.
+    heights = layers.height_map(box_m=box)
+    assert heights.values.shape == (H, W)
+    tops = np.full((H, W), np.nan)
+    for name, voxels in layers.occupied_in(box).items():
+        edge_m = layers[name].geometry.voxel_edge_m
+        for i, j, k in voxels.numbers.tolist():
+            here = np.ix_(np.floor(y / edge_m + 1e-9) == j, np.floor(x / edge_m + 1e-9) == i)
+            tops[here] = np.fmax(tops[here], (k + 1) * edge_m)
+    np.testing.assert_allclose(heights.values, tops)
+    # Somewhere without cells, and the whole map.
+    assert layers.layer_at(0.0, box_m=[[50, 50, 0], [51, 51, 1]]).values.size == 0
+    assert layers.height_map().values.size > heights.values.size
+
+
+def test_layers_make_one_table(layers: LayeredSnapshot) -> None:
+    parts = layers.occupied_in()
+    table = joined_layers(list(parts.values()))
+    assert len(table) == sum(map(len, parts.values()))
+    assert table.readings.keys() == {"colour", "temperature"}
+    start = 0
+    for name, part in parts.items():
+        rows = slice(start, start := start + len(part))
+        for channel, reading in table.readings.items():
+            own = part.readings.get(channel)
+            assert reading.weight[rows].tolist() == ([0] * len(part) if own is None else own.weight.tolist())
+            assert own is not None or layers[name].geometry.channel(channel) is None
+
+
+def test_a_level_is_in_sets_and_images_and_not_in_rays() -> None:
+    ground, evidence = layer(level_geometry(), 3), layer(Geometry(voxel_edge_um=40_000, depth=3, channels=()), 4)
+    both = LayeredSnapshot({"ground": ground, "evidence": evidence})
+    assert both.names == ("evidence", "ground")
+    assert len(both.occupied_in()["ground"])
+    rays = np.zeros((1, 3)), [[0.0, 0.0, -1.0]]
+    alone = evidence.cast_rays(*rays, max_range_m=9.0)
+    np.testing.assert_allclose(both.cast_rays(*rays, max_range_m=9.0).distance_m, alone.distance_m)
+    with pytest.raises(BadInputError) as refused:
+        LayeredSnapshot({"ground": ground}).cast_rays(*rays, max_range_m=9.0)
+    assert refused.value.kind == "level_layer"
+    with pytest.raises(BadInputError) as refused:
+        both.cast_rays(*rays, max_range_m=-1)
+    assert refused.value.kind == "bad_range"
