@@ -85,12 +85,16 @@ MAY_NAME = {
     "obstore": ["cairn_server/store/objects/bucket.py"],
     "cryptography": ["cairn_map/commits/signature.py", "cairn_server/access/server_certificate.py"],
     "websockets": [
-        "cairn_client/http/bridge_link.py",
+        "cairn_client/links/bridge_link.py",
         "cairn_client/live/foxglove_source.py",
         "cairn_client/publish/bridge_sink.py",
         "cairn_client/publish/foxglove_server.py",
     ],
-    "zenoh": ["cairn_client/live/zenoh_source.py"],
+    "zenoh": [
+        "cairn_client/links/zenoh_link.py",
+        "cairn_client/live/zenoh_source.py",
+        "cairn_client/publish/zenoh_sink.py",
+    ],
     "rclpy": [],
     "laspy": ["cairn_map/files/laz.py", "cairn_fusion/clouds/cloud_file.py"],
     "lazrs": ["cairn_map/files/laz.py"],
@@ -118,7 +122,7 @@ ROOMS = {
     """,
     "cairn_calib": "rig board board.discs exchange corner_search solve diagnosis report thermal verify cli",
     "cairn_fusion": "recording clouds ros transfer mapping.level mapping image_fusion view importers warm_up",
-    "cairn_client": "replica sync http relay robot folders publish live cli cli.doctor cli.maps cli.robots main",
+    "cairn_client": "replica sync http relay robot folders links publish live cli cli.doctor cli.maps cli.robots main",
     "cairn_sim": "scene render robots evaluation experiment study demo sim_command warm_up",
     "cairn_server": """
         memory_shares cell_room settings processes map_refusals

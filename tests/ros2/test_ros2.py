@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from tests.fixtures.client.bridge import Bridge
 from tests.fixtures.client.live_run import MAKE, VOXEL_M, LiveRun, replay_digest, send_all
@@ -15,13 +16,17 @@ from tests.fixtures.fusion.live_drive import drive, wire_of
 from tests.fixtures.fusion.ros2_messages import MESSAGES, rosbags_message, store, vectors, without_padding
 
 from cairn_client.live.live_doors import open_door
+from cairn_client.publish.ros2_sink import Ros2Sink
 from cairn_fusion.mapping.scan_gate import ScanGate
+from cairn_fusion.ros.map_messages import MapMessage, RobotPose, grid_message, path_message
 from cairn_fusion.ros.topic_mapping import mapping_from_yaml
 from cairn_map.evidence.channels import COLOUR
 from cairn_map.evidence.grid import geometry_for
+from cairn_map.queries.floor_grid import FloorGrid
 
 rclpy = pytest.importorskip("rclpy", reason="this Python has no ROS 2: `make test-ros2` has one")
 
+from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy  # noqa: E402
 from rclpy.serialization import deserialize_message, serialize_message  # noqa: E402
 from tests.ros2.ros_messages import ros_message, type_of  # noqa: E402
@@ -118,6 +123,17 @@ class BridgedRobot:
         self._robot.close()
 
 
+def published() -> list[MapMessage]:
+    """Messages of a map whose types the wheels have."""
+    floor = FloorGrid(np.arange(6, dtype=np.int8).reshape(2, 3), edge_m=0.05, origin_m=(0.0, 1.0), ground_m=0.5)
+    pose = RobotPose(1.7e9, (1.0, 2.0, 3.0), (0.0, 0.0, 0.0, 1.0))
+    time_ns = 1_700_000_000_123_456_789
+    return [
+        grid_message("/map", floor, "map", time_ns),
+        path_message("/cairn/robots/mole/path", [pose], "map", time_ns),
+    ]
+
+
 @pytest.mark.parametrize("door", [RosRobot, BridgedRobot])
 def test_200_scans_of_a_node_are_the_map_of_their_replay(
     door: type[RosRobot] | type[BridgedRobot], tmp_path: Path
@@ -146,7 +162,39 @@ def test_ros_writes_the_vectors_of_its_distribution_and_reads_ours(kind: str) ->
     assert without_padding(kind, again) == ours == data
 
 
-def test_a_node_gets_the_floor_late_and_codes_it_to_our_bytes() -> None:
+@pytest.mark.parametrize("message", published(), ids=lambda message: message.topic)
+def test_a_node_gets_what_is_published_late_and_codes_it_to_our_bytes(message: MapMessage) -> None:
+    context = rclpy.Context()
+    rclpy.init(context=context, domain_id=DOMAIN)
+    came: list[bytes] = []
+    with Ros2Sink(domain=DOMAIN) as sink:
+        sink.send(message._replace(topic="/tf"))
+        sink.send(message._replace(topic="/cairn/robots/mole-2/path"))  # no name of ROS
+        sink.send(message)
+        node = rclpy.create_node("nav2", context=context)
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        node.create_subscription(type_of(message.type_name), message.topic, came.append, latched, raw=True)
+        executor = SingleThreadedExecutor(context=context)
+        executor.add_node(node)
+
+        def has_come() -> bool:
+            executor.spin_once(timeout_sec=0.05)
+            return bool(came)
+
+        try:
+            wait_until(has_come)
+            topics = dict(node.get_topic_names_and_types())
+        finally:
+            executor.shutdown()
+            node.destroy_node()
+            context.try_shutdown()
+    assert message.topic in topics and "/tf" not in topics
+    assert bytes(came[0]) == message.data
+    ros = deserialize_message(message.data, type_of(message.type_name))
+    assert without_padding(message.type_name, bytes(serialize_message(ros))) == message.data
+
+
+def test_what_a_node_keeps_comes_through_our_door() -> None:
     kind = "nav_msgs/msg/OccupancyGrid"
     ours = bytes(store().serialize_cdr(rosbags_message(kind, MESSAGES[kind]), kind))
     context = rclpy.Context()

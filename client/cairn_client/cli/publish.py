@@ -22,8 +22,13 @@ Topics, all in the frame `map` (--frame), lengths in metres, temperatures in deg
 The storey of /map is that of --ground; without it the largest one, chosen again after each change, but left only for
 one with twice its free area. A viewer that joins late gets the newest message of each topic at once.
 
---through ws://robot:8765 sends all but /tf to a robot's own Foxglove bridge, which publishes it there: Nav2 gets /map,
-and this machine needs no ROS. A bridge keeps nothing for nodes that come late, so /map is sent again every 5 s.
+Robots get all but /tf as topics of their own ROS, Nav2 /map among them, without a ROS on this machine:
+
+    --through ws://robot:8765   by the robot's Foxglove bridge, which publishes it there; it keeps nothing for nodes
+                                that come late, so /map is sent again every 5 s
+    --zenoh zenoh://robot:7447  by a zenoh router, of rmw_zenoh (?domain=N: ROS_DOMAIN_ID) or of zenoh-bridge-ros2dds;
+                                nodes that come late get the newest message of each topic
+    --ros2                      by the ROS 2 of this machine, in the domain of ROS_DOMAIN_ID, kept in the same way
 
 A file is FILE.part until the command ends, at a change's number, by Ctrl-C or by SIGTERM; then it has its index.
 
@@ -53,7 +58,7 @@ from cairn_map.wire.live_events import CellsEvent, Hello, MarksEvent, RobotHeard
 
 if TYPE_CHECKING:
     from cairn_client.publish.followed_map import FollowedMap
-    from cairn_client.publish.map_publisher import MapPublisher
+    from cairn_client.publish.map_publisher import MapPublisher, Sink
     from cairn_client.publish.mcap_file import McapFile
 
 ADDRESS = re.compile(r"(?:(?P<host>[^\s:]+|\[[0-9a-fA-F:]+\]):)?(?P<port>\d{1,5})")
@@ -72,10 +77,10 @@ def add_parser(commands: Subparsers) -> None:
     )
     publish.add_argument("--mcap", type=Path, metavar="FILE", help="write the messages into a file")
     publish.add_argument("--through", metavar="URL", help="send to the Foxglove bridge at ws://HOST:PORT, for its ROS")
+    publish.add_argument("--zenoh", metavar="URL", help="send to the ROS 2 of the router at zenoh://HOST:PORT?domain=N")
+    publish.add_argument("--ros2", action="store_true", help="send to the ROS 2 of this machine")
     publish.add_argument("--ca", type=Path, metavar="FILE", help="issuer of the certificate of wss:// (this machine's)")
-    publish.add_argument(
-        "--follow", action="store_true", help="go on with each change; with --foxglove or --through it does"
-    )
+    publish.add_argument("--follow", action="store_true", help="go on with each change; with all but --mcap it does")
     publish.add_argument("--changes", type=int, metavar="N", help="end after so many changes, the first state included")
     publish.add_argument("--octomap", action="store_true", help="the octree of occupied and free space, too, once")
     publish.add_argument("--frame", default="map", type=_frame, metavar="NAME", help="frame of the map (map)")
@@ -87,44 +92,69 @@ def add_parser(commands: Subparsers) -> None:
 def _run(args: argparse.Namespace) -> int:
     _check_options(args)
     try:
-        from cairn_client.publish.bridge_sink import BridgeSink
         from cairn_client.publish.followed_map import FollowedMap
-        from cairn_client.publish.foxglove_server import FoxgloveServer
-        from cairn_client.publish.map_publisher import FloorChoice, MapPublisher, Sink
-        from cairn_client.publish.mcap_file import McapFile
+        from cairn_client.publish.map_publisher import FloorChoice, MapPublisher
     except ModuleNotFoundError as exc:
-        raise BadInputError(
-            "missing_extra", f'publishing needs {exc.name}: pip install "cairn-robotics[robot]"'
-        ) from exc
+        raise _missing_extra(exc) from exc
     api, name = api_of(args.map, args.token)
     with _ended_by_sigterm(), ExitStack() as open_parts:
         open_parts.enter_context(api)
         followed = FollowedMap(api, name)
         # Checked before a file is begun: a band is of the map's voxels.
         followed.snapshot.floor_grid(ground_m=args.ground or 0.0, band_m=args.band)
-        sinks: list[Sink] = []
-        if args.foxglove is not None:
-            host, port = args.foxglove
-            server = open_parts.enter_context(
-                FoxgloveServer(f"cairn: {name}", host=host, port=port, origins=args.origin)
-            )
-            sinks.append(server)
-            _say_at_once(f'{name} at {server.url}: open it in Foxglove or Lichtblick ("Foxglove WebSocket")')
-        if args.through is not None:
-            sinks.append(open_parts.enter_context(BridgeSink(args.through, ca_file=args.ca)))
-            _say_at_once(f"{name} through {args.through}")
-        if args.mcap is not None:
-            file = McapFile(args.mcap)
-            # After it is closed, also by Ctrl-C, which is how a file that follows a map ends.
-            open_parts.callback(_say_written, file)
-            sinks.append(open_parts.enter_context(file))
+        sinks = _open_sinks(args, name, open_parts)
         choice = FloorChoice(ground_m=args.ground, band_m=args.band, frame=args.frame)
         publisher = MapPublisher(api, followed, sinks, choice)
-        if not (args.follow or args.foxglove is not None or args.through is not None):
-            _publish_once(api, followed, publisher, args)
-        else:
+        if args.follow or _is_live(args):
             _follow(api, followed, publisher, args)
+        else:
+            _publish_once(api, followed, publisher, args)
     return 0
+
+
+def _open_sinks(args: argparse.Namespace, name: str, open_parts: ExitStack) -> "list[Sink]":
+    """Places that the options name, each closed with the stack."""
+    try:
+        from cairn_client.publish.bridge_sink import BridgeSink
+        from cairn_client.publish.foxglove_server import FoxgloveServer
+        from cairn_client.publish.mcap_file import McapFile
+        from cairn_client.publish.ros2_sink import Ros2Sink
+
+        if args.zenoh is not None:
+            from cairn_client.publish.zenoh_sink import ZenohSink
+    except ModuleNotFoundError as exc:
+        raise _missing_extra(exc) from exc
+    sinks: list[Sink] = []
+    if args.foxglove is not None:
+        host, port = args.foxglove
+        server = open_parts.enter_context(FoxgloveServer(f"cairn: {name}", host=host, port=port, origins=args.origin))
+        sinks.append(server)
+        _say_at_once(f'{name} at {server.url}: open it in Foxglove or Lichtblick ("Foxglove WebSocket")')
+    if args.through is not None:
+        sinks.append(open_parts.enter_context(BridgeSink(args.through, ca_file=args.ca)))
+        _say_at_once(f"{name} through {args.through}")
+    if args.zenoh is not None:
+        sinks.append(open_parts.enter_context(ZenohSink(args.zenoh)))
+        _say_at_once(f"{name} through {args.zenoh}")
+    if args.ros2:
+        sinks.append(open_parts.enter_context(Ros2Sink()))
+        _say_at_once(f"{name} in the ROS 2 of this machine")
+    if args.mcap is not None:
+        file = McapFile(args.mcap)
+        # After it is closed, also by Ctrl-C, which is how a file that follows a map ends.
+        open_parts.callback(_say_written, file)
+        sinks.append(open_parts.enter_context(file))
+    return sinks
+
+
+def _missing_extra(exc: ModuleNotFoundError) -> BadInputError:
+    extras = "robot,live" if exc.name == "zenoh" else "robot"
+    return BadInputError("missing_extra", f'publishing needs {exc.name}: pip install "cairn-robotics[{extras}]"')
+
+
+def _is_live(args: argparse.Namespace) -> bool:
+    """True if the map goes to programs that run, not into a file alone."""
+    return args.ros2 or any(given is not None for given in (args.foxglove, args.through, args.zenoh))
 
 
 def _check_options(args: argparse.Namespace) -> None:
@@ -133,12 +163,13 @@ def _check_options(args: argparse.Namespace) -> None:
     Raises:
         BadInputError: kind `nothing_asked`, `bad_option`.
     """
-    is_live = args.foxglove is not None or args.through is not None
-    if not is_live and args.mcap is None:
-        raise BadInputError("nothing_asked", "say where to publish: --foxglove PORT, --through URL, or --mcap FILE")
+    if not _is_live(args) and args.mcap is None:
+        raise BadInputError(
+            "nothing_asked", "say where to publish: --foxglove PORT, --through URL, --zenoh URL, --ros2, or --mcap FILE"
+        )
     if args.ca is not None and args.through is None:
         raise BadInputError("bad_option", "--ca is about a bridge behind TLS: give --through wss://HOST:PORT, too")
-    if args.changes is not None and (args.changes < 1 or not (args.follow or is_live)):
+    if args.changes is not None and (args.changes < 1 or not (args.follow or _is_live(args))):
         raise BadInputError("bad_option", "--changes N, 1 or more, is for a map that is followed: give --follow, too")
     if args.origin and args.foxglove is None:
         raise BadInputError("bad_option", "--origin is about viewers: give --foxglove PORT, too")

@@ -11,13 +11,12 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
 from websockets.sync.client import ClientConnection
 
-from cairn_client.http.bridge_link import CONNECT_S, LINK_ERRORS, certificate_checks, connect_bridge, is_bridge_url
+from cairn_client.links.bridge_link import BridgeLinks, is_bridge_url
 from cairn_client.live.foxglove_frames import (
     CHANNELS_MAX,
     Advertised,
@@ -32,7 +31,7 @@ from cairn_client.live.foxglove_frames import (
 from cairn_client.live.inbox import Inbox
 from cairn_client.live.live_source import bad_url
 from cairn_fusion.ros.bag import BagMessage, Topic
-from cairn_map.errors import BadInputError, DamagedDataError
+from cairn_map.errors import DamagedDataError
 
 log = logging.getLogger(__name__)
 
@@ -83,7 +82,7 @@ class FoxgloveSource:
         if not is_bridge_url(url):
             raise bad_url(url)
         self.url = url
-        self._checks = certificate_checks(url, ca_file)
+        self._links = BridgeLinks(url, ca_file, self._use, pauses_s=AGAIN_S, name="cairn-live")
         self.links = 0
         """Times that a link was made."""
         self.damaged = 0
@@ -98,8 +97,6 @@ class FoxgloveSource:
         self._subscriptions: dict[str, _Subscription] = {}
         self._by_number: dict[int, str] = {}
         self._numbers = 0
-        self._closing = threading.Event()
-        self._thread: threading.Thread | None = None
 
     @property
     def topics(self) -> dict[str, Topic]:
@@ -127,10 +124,7 @@ class FoxgloveSource:
             BadInputError: kind `no_bridge`: nothing answers there; kind `no_foxglove`: something else does.
         """
         self._wanted = wanted
-        stack = ExitStack()
-        link = self._connect(stack)
-        self._thread = threading.Thread(target=self._receive, args=(stack, link), name="cairn-live", daemon=True)
-        self._thread.start()
+        self._links.start()
 
     def take(self, *, within_s: float) -> list[BagMessage]:
         """All messages that wait, as soon as there are any."""
@@ -138,49 +132,22 @@ class FoxgloveSource:
 
     def close(self) -> None:
         """End the link; what waits may still be taken."""
-        self._closing.set()
         self._inbox.close()
-        if self._thread is not None:
-            self._thread.join(CONNECT_S + 1)
+        self._links.stop()
 
-    def _connect(self, stack: ExitStack) -> ClientConnection:
-        """A link that is closed with the stack."""
-        return connect_bridge(stack, self.url, self._checks)
-
-    def _receive(self, stack: ExitStack, first: ClientConnection) -> None:
-        """Receive until `close`, over one link after the other."""
-        link: ClientConnection | None = first
-        tries = 0
-        while not self._closing.is_set():
-            with stack:
-                try:
-                    if link is None:
-                        link = self._connect(stack)
-                    tries = 0
-                    self._begin_link()
-                    self._listen(link)
-                except BadInputError as exc:
-                    log.debug("%s", exc.message)
-                except LINK_ERRORS as exc:
-                    log.info("the link to %s is lost: %s", self.url, exc or type(exc).__name__)
-                finally:
-                    self._end_link()
-            link, stack = None, ExitStack()
-            self._closing.wait(AGAIN_S[min(tries, len(AGAIN_S) - 1)])
-            tries += 1
-
-    def _begin_link(self) -> None:
+    def _use(self, link: ClientConnection) -> None:
+        """Receive over one link."""
         self.links += 1
         self.lost_since_s = None
-
-    def _end_link(self) -> None:
-        if self.lost_since_s is None:
+        try:
+            self._listen(link)
+        finally:
             self.lost_since_s = self._steady_s()
-        with self._lock:
-            self._channels, self._subscriptions, self._by_number = {}, {}, {}
+            with self._lock:
+                self._channels, self._subscriptions, self._by_number = {}, {}, {}
 
     def _listen(self, link: ClientConnection) -> None:
-        while not self._closing.is_set():
+        while not self._links.closing.is_set():
             try:
                 frame = link.recv(timeout=LOOK_S)
             except TimeoutError:

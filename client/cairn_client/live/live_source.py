@@ -11,15 +11,12 @@ of cameras and maps: one assembler decides for all doors (`cairn_fusion.ros.live
 from collections import Counter
 from collections.abc import Callable
 from typing import Protocol
-from urllib.parse import parse_qsl
 
 from cairn_fusion.ros.bag import BagMessage, Topic
 from cairn_map.errors import BadInputError
 
 SCHEMES = ("ws://", "wss://", "zenoh://", "ros2:")
 """Beginnings of the URLs of live sources."""
-DOMAIN_MAX = 232
-"""Largest ROS_DOMAIN_ID."""
 URL_HELP = (
     "a live source is ws://HOST:PORT or wss://HOST:PORT of a Foxglove bridge, zenoh://HOST:PORT of a zenoh router, or "
     "ros2: for the ROS 2 of this machine"
@@ -87,16 +84,3 @@ class LiveSource(Protocol):
 def bad_url(url: str) -> BadInputError:
     """Error of a URL that is none of a live source."""
     return BadInputError("bad_url", f"{URL_HELP}; got {url!r:.200}")
-
-
-def domain_of(query: str) -> int:
-    """ROS_DOMAIN_ID of a URL's query, `domain=N`.
-
-    Raises:
-        ValueError: it says something else, or a number that is none.
-    """
-    fields = dict(parse_qsl(query, strict_parsing=True))
-    text = fields.pop("domain", "")
-    if fields or not (text.isascii() and text.isdigit() and int(text[:9]) <= DOMAIN_MAX):
-        raise ValueError(f"{query!r:.100} is no domain=N")
-    return int(text[:9])

@@ -1,7 +1,7 @@
 """Door of the ROS 2 of this machine: rclpy's subscriptions, whose messages stay as they were coded.
 
     source /opt/ros/jazzy/setup.bash
-    cairn robot live ros2: --topics live.yaml --map URL       with the Python of that ROS, 3.11 or newer: not Humble's
+    cairn robot live ros2: --topics live.yaml --map URL
 
 Topics are asked for again and again, as nodes come and go. A subscription is reliable if all publishers of its topic
 are, and asks for the messages that they keep if all keep some; if that changes it is made again. It matches every
@@ -16,11 +16,12 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
+from cairn_client.links.link_url import domain_of
+from cairn_client.links.ros2_node import Ros2Node, message_type
 from cairn_client.live.inbox import Inbox
-from cairn_client.live.live_source import bad_url, domain_of
+from cairn_client.live.live_source import bad_url
 from cairn_fusion.ros.bag import BagMessage, Topic, Wire
 from cairn_fusion.ros.messages import CLOUDS, COMPRESSED, IMAGE, plain_type
-from cairn_map.errors import BadInputError
 
 log = logging.getLogger(__name__)
 
@@ -33,10 +34,6 @@ CLOSE_S = 3.0
 IMAGES, SMALL = 10, 500
 """Messages of a topic that ROS keeps until they are taken: of images and clouds, and of all others."""
 LARGE = frozenset([IMAGE, COMPRESSED]) | CLOUDS
-ROS_HELP = (
-    "source the ROS of this machine first (source /opt/ros/$ROS_DISTRO/setup.bash), and run cairn with its Python, "
-    "3.11 or newer; with Humble's 3.10, or without ROS here, use the Foxglove bridge: ws://HOST:8765"
-)
 
 
 class RclpySource:
@@ -95,19 +92,9 @@ class RclpySource:
             BadInputError: kind `no_ros2`: there is none in this Python.
         """
         self._wanted = wanted
-        try:
-            rclpy: Any = importlib.import_module("rclpy")
-            context = rclpy.Context()
-            rclpy.init(context=context, domain_id=self._domain)
-            node = rclpy.create_node(NODE, context=context, enable_rosout=False, start_parameter_services=False)
-            executor = importlib.import_module("rclpy.executors").SingleThreadedExecutor(context=context)
-        except (ImportError, OSError, RuntimeError) as exc:
-            raise BadInputError("no_ros2", f"this Python has no ROS 2 ({exc}); {ROS_HELP}") from exc
-        executor.add_node(node)
+        node = Ros2Node(NODE, domain=self._domain)
         self.links = 1
-        self._thread = threading.Thread(
-            target=self._receive, args=(context, node, executor), name="cairn-live", daemon=True
-        )
+        self._thread = threading.Thread(target=self._receive, args=(node,), name="cairn-live", daemon=True)
         self._thread.start()
 
     def take(self, *, within_s: float) -> list[BagMessage]:
@@ -121,8 +108,10 @@ class RclpySource:
         if self._thread is not None:
             self._thread.join(CLOSE_S)
 
-    def _receive(self, context: Any, node: Any, executor: Any) -> None:
-        """Receive until `close`; all of rclpy is used by this thread alone."""
+    def _receive(self, node: Ros2Node) -> None:
+        """Receive until `close`; from here on this thread alone uses rclpy."""
+        executor = importlib.import_module("rclpy.executors").SingleThreadedExecutor(context=node.context)
+        executor.add_node(node.node)
         look_s = 0.0
         try:
             while not self._closing.is_set():
@@ -135,14 +124,13 @@ class RclpySource:
             self.lost_since_s = time.monotonic()
         finally:
             executor.shutdown()
-            node.destroy_node()
-            context.try_shutdown()
+            node.close()
 
-    def _look(self, node: Any) -> None:
+    def _look(self, node: Ros2Node) -> None:
         """Take over which topics there are, and subscribe to those that are wanted."""
         topics = {}
-        for name, kinds in node.get_topic_names_and_types():
-            publishers = node.get_publishers_info_by_topic(name)
+        for name, kinds in node.node.get_topic_names_and_types():
+            publishers = node.node.get_publishers_info_by_topic(name)
             if not publishers:
                 continue
             topics[name] = topic = Topic(name, plain_type(kinds[0]), Wire.CDR, 0)
@@ -153,26 +141,20 @@ class RclpySource:
         with self._lock:
             self._topics = topics
 
-    def _subscribe(self, node: Any, name: str, kind: str, *, is_reliable: bool, is_latched: bool) -> None:
+    def _subscribe(self, node: Ros2Node, name: str, kind: str, *, is_reliable: bool, is_latched: bool) -> None:
         known = self._subscriptions.get(name)
         if kind in self._unknown or (known is not None and known[0] == (kind, is_reliable, is_latched)):
             return
-        package, _, message = kind.partition("/msg/")
-        try:
-            message_type = getattr(importlib.import_module(f"{package}.msg"), message)
-        except (ImportError, AttributeError):
+        kind_of_ros = message_type(kind)
+        if kind_of_ros is None:
             self._unknown.add(kind)
             log.warning("%s: this ROS has no package for %s; topics of it are left aside", self.url, kind)
             return
         if known is not None:
-            node.destroy_subscription(known[1])
-        qos: Any = importlib.import_module("rclpy.qos")
-        profile = qos.QoSProfile(
-            depth=IMAGES if plain_type(kind) in LARGE else SMALL,
-            reliability=qos.ReliabilityPolicy.RELIABLE if is_reliable else qos.ReliabilityPolicy.BEST_EFFORT,
-            durability=qos.DurabilityPolicy.TRANSIENT_LOCAL if is_latched else qos.DurabilityPolicy.VOLATILE,
-        )
-        subscription = node.create_subscription(
-            message_type, name, lambda data, name=name: self._inbox.receive(name, bytes(data)), profile, raw=True
+            node.node.destroy_subscription(known[1])
+        depth = IMAGES if plain_type(kind) in LARGE else SMALL
+        profile = node.quality(depth=depth, is_reliable=is_reliable, is_latched=is_latched)
+        subscription = node.node.create_subscription(
+            kind_of_ros, name, lambda data, name=name: self._inbox.receive(name, bytes(data)), profile, raw=True
         )
         self._subscriptions[name] = (kind, is_reliable, is_latched), subscription

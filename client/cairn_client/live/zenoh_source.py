@@ -1,6 +1,6 @@
 """Door of zenoh: ROS 2 over rmw_zenoh, or DDS behind zenoh-bridge-ros2dds; through a router, as its client.
 
-    zenoh://HOST:PORT?domain=0      that of `rmw_zenohd`, or of the bridge: port 7447
+    zenoh://HOST:PORT?domain=0      see `zenoh_link`
 
 Publishers announce themselves by liveliness tokens (`zenoh_keys`); a topic is subscribed as soon as there is one, once
 for all its publishers. Messages that publishers keep for those who come late, as of /tf_static, are asked for. zenoh
@@ -18,23 +18,15 @@ from typing import Any
 import zenoh
 from zenoh import ext
 
-from cairn_client.http.bridge_link import url_parts
+from cairn_client.links.zenoh_keys import Publisher, publisher_of, tokens_of
+from cairn_client.links.zenoh_link import CONNECT_S, LOOK_S, is_linked, open_session, router_of
 from cairn_client.live.inbox import Inbox
-from cairn_client.live.live_source import bad_url, domain_of
-from cairn_client.live.zenoh_keys import Publisher, publisher_of, tokens_of
+from cairn_client.live.live_source import bad_url
 from cairn_fusion.ros.bag import BagMessage, Topic
 from cairn_fusion.ros.bag_index import STATIC_NAME
-from cairn_map.errors import BadInputError
 
 log = logging.getLogger(__name__)
 
-PORT = 7447
-DOMAIN = 0
-MESSAGE_BYTES_MAX = 64 << 20
-"""Largest message; a cloud of a million points with 48 bytes each has less."""
-CONNECT_S = 2.5
-LOOK_S = 0.25
-"""Time between two looks whether the router is there."""
 TOKENS_MAX = 10_000
 """Most publishers that are known; more are left aside."""
 SENDERS_MAX = 10_000
@@ -43,10 +35,6 @@ LATCHED_MAX = 16
 NUMBER = struct.Struct("<q")
 """Sequence number, the head of rmw_zenoh's attachment; the publisher's id is its end."""
 ATTACHMENT_BYTES = 33
-ROUTER_HELP = (
-    "start one on the robot: `ros2 run rmw_zenoh_cpp rmw_zenohd` where RMW_IMPLEMENTATION is rmw_zenoh_cpp, else "
-    "`zenoh-bridge-ros2dds`"
-)
 
 
 class ZenohSource:
@@ -58,15 +46,10 @@ class ZenohSource:
         Raises:
             BadInputError: kind `bad_url`: it is none.
         """
-        parts = url_parts(url, "zenoh")
-        if parts is None or parts.path.strip("/") or parts.fragment or parts.username:
+        router = router_of(url)
+        if router is None:
             raise bad_url(url)
-        try:
-            self._domain = domain_of(parts.query) if parts.query else DOMAIN
-        except ValueError as exc:
-            raise bad_url(url) from exc
-        host = f"[{parts.hostname}]" if ":" in (parts.hostname or "") else parts.hostname
-        self._endpoint = f"tcp/{host}:{parts.port or PORT}"
+        self._router = router
         self.url = url
         self.links = 0
         self.damaged = 0
@@ -111,13 +94,9 @@ class ZenohSource:
             BadInputError: kind `no_router`: none answers there.
         """
         self._wanted = wanted
-        try:
-            self._session = zenoh.open(_config(self._endpoint))
-        except zenoh.ZError as exc:
-            said = str(exc).split(" at ")[0][:200]
-            raise BadInputError("no_router", f"no zenoh router answers at {self.url} ({said}); {ROUTER_HELP}") from exc
+        self._session = open_session(self._router)
         self.links = 1
-        for tokens in tokens_of(self._domain):
+        for tokens in tokens_of(self._router.domain):
             self._subscribers[tokens] = self._session.liveliness().declare_subscriber(
                 tokens, self._take_token, history=True
             )
@@ -156,7 +135,7 @@ class ZenohSource:
             self._changed.clear()
             try:
                 self._subscribe_new()
-                self._note_link(is_there=bool(self._session.info.routers_zid()))
+                self._note_link(is_there=is_linked(self._session))
             except zenoh.ZError as exc:
                 log.info("%s: %s", self.url, exc)
 
@@ -203,19 +182,3 @@ class ZenohSource:
             self._numbers[sender] = number if last is None else max(last, number)
             while len(self._numbers) > SENDERS_MAX:
                 del self._numbers[next(iter(self._numbers))]
-
-
-def _config(endpoint: str) -> "zenoh.Config":
-    """Settings of a client of one router: it looks for no other, and listens to none."""
-    config = zenoh.Config()
-    for key, value in (
-        # A peer sees nothing behind rmw_zenoh's router, which does not forward between peers.
-        ("mode", '"client"'),
-        ("connect/endpoints", f'["{endpoint}"]'),
-        ("connect/timeout_ms", str(round(CONNECT_S * 1000))),
-        ("scouting/multicast/enabled", "false"),
-        ("scouting/gossip/enabled", "false"),
-        ("transport/link/rx/max_message_size", str(MESSAGE_BYTES_MAX)),
-    ):
-        config.insert_json5(key, value)
-    return config

@@ -23,7 +23,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import Server, ServerConnection, serve
 from websockets.typing import Origin, Subprotocol
 
-from cairn_client.http.bridge_link import SUBPROTOCOLS
+from cairn_client.links.bridge_link import SUBPROTOCOLS
 from cairn_fusion.ros.map_messages import MapMessage, definition_of
 from cairn_map.errors import BadInputError
 

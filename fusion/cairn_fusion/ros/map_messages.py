@@ -104,6 +104,11 @@ def definition_of(type_name: str, wire: Wire = Wire.CDR) -> str:
     return text
 
 
+def hash_of(type_name: str) -> str:
+    """Hash of a type's definition, RIHS01 (REP 2011), as ROS 2 from Iron on has it."""
+    return str(_store().hash_rihs01(type_name))
+
+
 def grid_message(topic: str, grid: FloorGrid, frame: str, time_ns: int) -> MapMessage:
     """A storey's floor."""
     H, W = grid.values.shape

@@ -8,8 +8,8 @@ from tests.fixtures.client.live_server import wait_until
 from tests.fixtures.client.zenoh_robot import a_zenoh_robot
 from tests.fixtures.fusion.live_drive import START_S, depth, drive, latched, moving
 
+from cairn_client.links.zenoh_keys import publisher_of, tokens_of
 from cairn_client.live.live_doors import open_door
-from cairn_client.live.zenoh_keys import publisher_of, tokens_of
 from cairn_fusion.mapping.scan_gate import ScanGate
 from cairn_fusion.ros.bag import Topic, Wire
 from cairn_map.errors import BadInputError

@@ -79,7 +79,7 @@ def test_nodes_get_the_very_messages_but_transforms_and_the_floor_again(port: in
 
 
 def test_a_bridge_that_starts_again_gets_the_newest_of_each_topic(port: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("cairn_client.publish.bridge_sink.AGAIN_S", 0.05)
+    monkeypatch.setattr("cairn_client.publish.bridge_sink.AGAIN_S", (0.05,))
     first = Bridge(port, [Capability.ClientPublish])
     with BridgeSink(f"ws://127.0.0.1:{port}") as sink:
         sink.send(grid(1))

@@ -185,6 +185,7 @@ def test_a_map_without_ground_is_published_without_a_floor(server: LiveServer, t
         (["--mcap=a.mcap", "--band=0.01,1"], "at least a voxel"),
         (["--mcap=nowhere/a.mcap"], "cannot write"),
         (["--foxglove=203.0.113.7:1"], "another port"),
+        (["--ros2"], "this Python has no ROS 2 .* source the ROS of this machine first"),
         (["--mcap=a.mcap", "--changes=2"], "give --follow"),
         (["--mcap=a.mcap", "--follow", "--changes=0"], "1 or more"),
         (["--mcap=a.mcap", "--origin=http://viewer:8080"], "give --foxglove"),

@@ -1,20 +1,25 @@
-"""Link to a Foxglove bridge: its URL, the handshake, and errors that say what is there instead.
+"""Link to a Foxglove bridge: its URL, the handshake, errors that say what is there instead, and links that are lost.
 
     ws://HOST:PORT      wss://HOST:PORT, whose certificate must hold
 
 Both subprotocols are offered: `foxglove.sdk.v1` (bridges of today) and `foxglove.websocket.v1` (ROS 1, older ones).
 """
 
+import logging
 import ssl
+import threading
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from urllib.parse import SplitResult, urlsplit
 
 from websockets.exceptions import InvalidHandshake, InvalidMessage, InvalidURI, WebSocketException
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
+from cairn_client.links.link_url import url_parts
 from cairn_map.errors import BadInputError
+
+log = logging.getLogger(__name__)
 
 SUBPROTOCOLS = ("foxglove.sdk.v1", "foxglove.websocket.v1")
 LINK_ERRORS: tuple[type[Exception], ...] = (OSError, WebSocketException)
@@ -34,17 +39,6 @@ BRIDGE_HELP = (
 def is_bridge_url(url: str) -> bool:
     """True if a URL may be a bridge's."""
     return url_parts(url, "ws") is not None or url_parts(url, "wss") is not None
-
-
-def url_parts(url: str, scheme: str) -> SplitResult | None:
-    """Parts of SCHEME://HOST:PORT, with a host and a port that there may be; None: it is none."""
-    try:
-        parts = urlsplit(url)
-        host, port = parts.hostname or "", parts.port
-        host.encode("idna")  # as the system's resolver will
-    except ValueError:
-        return None
-    return parts if parts.scheme == scheme and host and port != 0 and "\0" not in host else None
 
 
 def certificate_checks(url: str, ca_file: Path | None) -> ssl.SSLContext | None:
@@ -102,3 +96,79 @@ def connect_bridge(stack: ExitStack, url: str, checks: ssl.SSLContext | None) ->
             f"{url} speaks none of {', '.join(SUBPROTOCOLS)} (rosbridge is another program); {BRIDGE_HELP}",
         )
     return link
+
+
+class BridgeLinks:
+    """Links to one bridge, one after the other, each used until it breaks, in a thread of their own."""
+
+    def __init__(
+        self,
+        url: str,
+        ca_file: Path | None,
+        use: Callable[[ClientConnection], None],
+        *,
+        pauses_s: Sequence[float],
+        name: str,
+    ) -> None:
+        """Connect to nothing yet.
+
+        Args:
+            url: ws://HOST:PORT or wss://HOST:PORT.
+            ca_file: issuer of the certificate of wss://, PEM; None: SSL_CERT_FILE, or those that this machine trusts.
+            use: called with each link; returns once `closing` is set.
+            pauses_s: pauses before a link is tried again, seconds; the last one repeats.
+            name: of the thread.
+
+        Raises:
+            BadInputError: kind `bad_option` or `no_file`: the issuer's file is for no wss://, or is none.
+        """
+        self.closing = threading.Event()
+        self._url = url
+        self._checks = certificate_checks(url, ca_file)
+        self._use = use
+        self._pauses_s = pauses_s
+        self._name = name
+        self._thread: threading.Thread | None = None
+
+    def start(self, greet: Callable[[ClientConnection], None] = lambda link: None) -> None:
+        """Connect, and go on in the thread.
+
+        Args:
+            greet: called with the first link, in the caller's thread; what it raises ends the link.
+
+        Raises:
+            BadInputError: no bridge is there, see `connect_bridge`.
+        """
+        stack = ExitStack()
+        link = connect_bridge(stack, self._url, self._checks)
+        try:
+            greet(link)
+        except BadInputError:
+            stack.close()
+            raise
+        self._thread = threading.Thread(target=self._run, args=(stack, link), name=self._name, daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the last link."""
+        self.closing.set()
+        if self._thread is not None:
+            self._thread.join(CONNECT_S + 1)
+
+    def _run(self, stack: ExitStack, first: ClientConnection) -> None:
+        link: ClientConnection | None = first
+        tries = 0
+        while not self.closing.is_set():
+            with stack:
+                try:
+                    if link is None:
+                        link = connect_bridge(stack, self._url, self._checks)
+                    tries = 0
+                    self._use(link)
+                except BadInputError as exc:
+                    log.debug("%s", exc.message)
+                except LINK_ERRORS as exc:
+                    log.info("the link to %s is lost: %s", self._url, exc or type(exc).__name__)
+            link, stack = None, ExitStack()
+            self.closing.wait(self._pauses_s[min(tries, len(self._pauses_s) - 1)])
+            tries += 1

@@ -6,7 +6,7 @@ zenoh-bridge-ros2dds    @/ZID/@ros2_lv/MP/camera§image/TYPE/QOS           TYPE:
                         camera/image
 
 HASH is of the type's definition, or `TypeHashNotSupported` (Humble); it is not compared, as these types have never
-changed. What others put on the network is no key of ROS: it is left aside.
+changed. What others put on the network is no key of ROS: it is left aside. A publisher of ours writes the same keys.
 """
 
 import re
@@ -23,6 +23,12 @@ TOPIC = re.compile(r"(?:/[^/\s*$?#]+)+")
 TRANSIENT_LOCAL = "1"
 """Durability of a publisher that keeps its last messages for those who come late."""
 QUALITY_PARTS = 3
+NO_HASH = "TypeHashNotSupported"
+"""Hash of every type in Humble, whose nodes hear of no message under another one."""
+NEWEST_KEPT = ":1:,1:,:,:,,"
+"""Quality of a reliable publisher that keeps its newest message for those who come late."""
+NODE = "NN"
+NODE_NAME = "cairn"
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,3 +70,35 @@ def publisher_of(token: str) -> Publisher | None:
     fields = quality.split(":")
     is_latched = len(fields) > QUALITY_PARTS and fields[durability] == TRANSIENT_LOCAL
     return Publisher(Topic(name, f"{kind[1]}/{kind[2]}", Wire.CDR, 0), key, is_latched)
+
+
+def has_no_hash(token: str) -> bool:
+    """True of a token of Humble's: of a publisher, a subscriber or a service without the hash of its type."""
+    return token.startswith(f"{RMW_ROOT}/") and f"/{NO_HASH}/" in token
+
+
+def node_token(domain: int, session: str) -> str:
+    """Token of our node of rmw_zenoh; `session`: the id of its session."""
+    return f"{RMW_ROOT}/{domain}/{session}/0/0/{NODE}/%/%/{NODE_NAME}"
+
+
+def publisher_token(domain: int, session: str, number: int, topic: Topic, type_hash: str) -> str:
+    """Token of a publisher of that node that keeps its newest message; `number`: of the publisher, from 1 on."""
+    place = f"{RMW_ROOT}/{domain}/{session}/0/{number}/{PUBLISHER}/%/%/{NODE_NAME}"
+    return f"{place}/{topic.name.replace('/', '%')}/{_mangled(topic.type)}/{type_hash}/{NEWEST_KEPT}"
+
+
+def message_key(domain: int, topic: Topic, type_hash: str) -> str:
+    """Key of a topic's messages for nodes of rmw_zenoh."""
+    return f"{domain}{topic.name}/{_mangled(topic.type)}/{type_hash}"
+
+
+def bridged_key(topic: Topic) -> str:
+    """Key of a topic's messages for nodes of DDS behind a bridge."""
+    return topic.name.removeprefix("/")
+
+
+def _mangled(kind: str) -> str:
+    """`sensor_msgs::msg::dds_::Image_` of sensor_msgs/Image."""
+    package, _, name = kind.partition("/")
+    return f"{package}::msg::dds_::{name}_"

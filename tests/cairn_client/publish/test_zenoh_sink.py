@@ -1,0 +1,147 @@
+"""Publishing over zenoh: nodes get the very bytes by the keys of rmw_zenoh and of the DDS bridge, late or not."""
+
+import queue
+import struct
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+from mcap.reader import make_reader
+from tests.fixtures.client.floors import push_storey
+from tests.fixtures.client.live_server import WAIT_S, LiveServer, wait_until
+from tests.fixtures.client.zenoh_robot import ZenohRobot, a_zenoh_robot
+from tests.fixtures.fusion.ros2_messages import vectors
+from zenoh import ext
+
+from cairn_client.cli.maps.command import main
+from cairn_client.links.zenoh_keys import publisher_of, publisher_token
+from cairn_client.live.live_doors import open_door
+from cairn_client.publish.zenoh_sink import ZenohSink
+from cairn_fusion.ros.bag import Topic, Wire
+from cairn_fusion.ros.map_messages import GRID, MapMessage, grid_message
+from cairn_map.errors import BadInputError
+from cairn_map.queries.floor_grid import FloorGrid
+
+TYPE = "nav_msgs::msg::dds_::OccupancyGrid_"
+HASH = vectors()["jazzy"][GRID]["hash"]
+KEY = f"7/map/{TYPE}/{HASH}"
+HUMBLE = "TypeHashNotSupported"
+
+
+def grid(value: int) -> MapMessage:
+    floor = FloorGrid(np.full((2, 3), value, np.int8), edge_m=0.05, origin_m=(0.0, 1.0), ground_m=0.0)
+    return grid_message("/map", floor, "map", 1_700_000_000_000_000_000)
+
+
+class Node:
+    """A node of the robot that subscribes as rmw_zenoh does: by its exact key, to what is kept for it, too."""
+
+    def __init__(self, robot: ZenohRobot, key: str) -> None:
+        self._came: queue.Queue[tuple[bytes, bytes]] = queue.Queue()
+        history = ext.HistoryConfig(detect_late_publishers=True, max_samples=1)
+        self._subscriber: Any = ext.declare_advanced_subscriber(robot.node, key, self._take, history=history)
+
+    def _take(self, sample: "zenoh.Sample") -> None:
+        assert sample.attachment is not None
+        self._came.put((bytes(sample.payload), bytes(sample.attachment)))
+
+    def next(self) -> tuple[bytes, bytes]:
+        return self._came.get(timeout=WAIT_S)
+
+    def newest(self, data: bytes) -> None:
+        """Wait until these bytes came."""
+        while self.next()[0] != data:
+            pass
+
+
+@pytest.fixture
+def robot() -> Iterator[ZenohRobot]:
+    with a_zenoh_robot() as robot:
+        yield robot
+
+
+@pytest.mark.parametrize("key", [KEY, "map"])
+def test_a_node_that_comes_late_gets_the_newest_message_and_then_each(robot: ZenohRobot, key: str) -> None:
+    early = Node(robot, key)
+    with ZenohSink(robot.url) as sink:
+        sink.send(grid(0)._replace(topic="/tf"))
+        sink.send(grid(6))
+        early.newest(grid(6).data)
+        sink.send(grid(7))
+        early.newest(grid(7).data)
+        late = Node(robot, key)
+        data, about = late.next()
+        assert data == grid(7).data
+        number, time_ns, size, sender = struct.unpack("<qqB16s", about)
+        assert (number, time_ns, size) == (2, 1_700_000_000_000_000_000, 16) and any(sender)
+        sink.send(grid(8))
+        late.newest(grid(8).data)
+
+
+def test_nodes_of_humble_get_them_under_keys_without_hashes(robot: ZenohRobot) -> None:
+    humble, newer = Node(robot, KEY.replace(HASH, HUMBLE)), Node(robot, KEY)
+    with ZenohSink(robot.url) as sink:
+        sink.send(grid(1))
+        newer.newest(grid(1).data)
+        token = f"@ros2_lv/7/{robot.node.info.zid()}/0/9/MS/%/%/nav2/%map/{TYPE}/{HUMBLE}/:1:,1:,:,:,,"
+        robot.node.liveliness().declare_token(token)
+        humble.newest(grid(1).data)
+        sink.send(grid(2))
+        humble.newest(grid(2).data)
+
+
+def test_a_router_that_starts_again_gets_the_newest_of_each_topic(robot: ZenohRobot) -> None:
+    with ZenohSink(robot.url) as sink:
+        sink.send(grid(1))
+        Node(robot, KEY).newest(grid(1).data)
+        robot.stop()
+        sink.send(grid(2))
+        robot.start()
+        Node(robot, KEY).newest(grid(2).data)
+
+
+def test_the_command_sends_what_it_writes_and_a_door_of_ours_finds_it(
+    robot: ZenohRobot, server: LiveServer, tmp_path: Path
+) -> None:
+    push_storey(server, tmp_path / "wren", wall_x=2)
+    source, came = open_door(robot.url), dict[str, bytes]()
+    source.open(lambda topic: True)
+    words = ["publish", server.map_url, "--zenoh", robot.url, f"--mcap={tmp_path / 'a.mcap'}", "--changes=2"]
+    publishing = threading.Thread(target=main, args=([*words, "--band=0.05,0.25"],))
+    publishing.start()
+
+    def has(*topics: str) -> bool:
+        came.update({message.topic: bytes(message.data) for message in source.take(within_s=0.05)})
+        return came.keys() >= set(topics)
+
+    try:
+        wait_until(lambda: has("/map", "/cairn/points", "/cairn/changed_points", "/cairn/hot_spots"))
+        assert source.topics["/map"].type == "nav_msgs/OccupancyGrid" and "/tf" not in source.topics
+        first = came.copy()
+        push_storey(server, tmp_path / "wren", wall_x=5)
+        wait_until(lambda: has() and came["/map"] != first["/map"])
+    finally:
+        publishing.join(WAIT_S)
+        source.close()
+    with (tmp_path / "a.mcap").open("rb") as stream:
+        written = [(channel.topic, record.data) for _, channel, record in make_reader(stream).iter_messages()]
+    assert set(first.items()) <= set(written) and ("/map", came["/map"]) in written
+
+
+def test_what_is_no_router_is_said_before_anything_is_published(server: LiveServer, tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match="ros2 run rmw_zenoh_cpp rmw_zenohd"):
+        main(["publish", server.map_url, "--zenoh=zenoh://127.0.0.1:9", f"--mcap={tmp_path / 'a.mcap'}"])
+    with pytest.raises(BadInputError, match="zenoh://HOST:PORT"):
+        main(["publish", server.map_url, "--zenoh=ws://127.0.0.1:9", f"--mcap={tmp_path / 'a.mcap'}"])
+    assert not list(tmp_path.glob("*.mcap*"))
+
+
+def test_tokens_of_ours_are_read_as_those_of_rmw_zenoh() -> None:
+    topic = Topic("/cairn/hot_spots", "visualization_msgs/MarkerArray", Wire.CDR, 0)
+    found = publisher_of(publisher_token(7, "ab12", 3, topic, HASH))
+    assert found is not None and found.topic == topic and found.is_latched
+    assert found.key == "7/cairn/hot_spots/visualization_msgs::msg::dds_::MarkerArray_/*"
