@@ -113,7 +113,8 @@ MAY_NAME = {
 ROOMS = {
     "cairn_map": """
         errors arrays progress machine_memory machine_clocks
-        kernels evidence epochs codec.octree codec.entropy codec commits wire files queries.level queries render
+        kernels evidence epochs codec.octree codec.entropy codec commits wire files queries.level queries queries.native
+        render
         warm_up
     """,
     "cairn_calib": "rig board board.discs exchange corner_search solve diagnosis report thermal verify cli",
