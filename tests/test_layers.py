@@ -118,7 +118,7 @@ ROOMS = {
     "cairn_map": """
         errors arrays progress machine_memory machine_clocks
         kernels evidence epochs codec.octree codec.entropy codec commits wire files queries.level queries queries.layers
-        render warm_up
+        queries.native render warm_up
     """,
     "cairn_calib": "rig board board.discs exchange corner_search solve diagnosis report thermal verify cli",
     "cairn_fusion": "recording clouds ros transfer mapping.level mapping image_fusion view importers warm_up",

@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from cairn_map.queries.level.elevation import Elevation, Vehicle
     from cairn_map.queries.map_snapshot import MapSnapshot
     from cairn_map.queries.mark_groups import MarkGroup, group_marks
+    from cairn_map.queries.native.point_handle import PointHandle
     from cairn_map.queries.occupancy_states import State
 
     __version__: str
@@ -73,6 +74,7 @@ __all__ = [
     "MarkGroup",
     "NotFoundError",
     "OutboxNearlyFull",
+    "PointHandle",
     "Profile",
     "Pushed",
     "Recording",
@@ -119,6 +121,7 @@ _MODULES = {
     "cairn_map.queries.level.elevation": "Elevation Vehicle",
     "cairn_map.queries.map_snapshot": "MapSnapshot",
     "cairn_map.queries.mark_groups": "MarkGroup group_marks",
+    "cairn_map.queries.native.point_handle": "PointHandle",
     "cairn_map.queries.occupancy_states": "State",
 }
 """Names by the module that defines them; the same as the imports above, which only type checkers read."""

@@ -7,6 +7,9 @@ both answer alike, and the rows say by how much they do not. Points are random i
 from the camera's places in random directions. One thread; the fewest CPU seconds of some runs, the two in turns.
 """
 
+import ctypes
+import shutil
+import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -20,6 +23,7 @@ from cairn_fusion.mapping.integrate import Integrator, integrate_scans
 from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.grid import Geometry
 from cairn_map.queries.map_snapshot import MapSnapshot, snapshot_of
+from cairn_map.queries.native.point_handle import PointHandle
 from cairn_map.queries.occupancy_states import State
 from cairn_sim.robots.record import Plan, scans_of, shots_of
 from cairn_sim.robots.robots import ROBOTS
@@ -86,12 +90,40 @@ def query_rows(smoke: bool) -> Iterator[Row]:
             ("castRay", rays_s, int(hits.sum()), theirs[0].hits),
         ):
             yield f"  OctoMap, {what}", f"{1e3 * seconds:.0f}", f"ms CPU; found {other}, ours {mine}"
+    yield from _single_rows(snapshot, points, points_s, 2 if smoke else 20)
     yield from _other_rows(snapshot, points[:FEW])
 
 
 def _snapshot_rows(whole: EvidenceMap, snapshot: MapSnapshot) -> Iterator[Row]:
     yield "  first snapshot", f"{1e3 * _cpu_s(lambda: snapshot_of(whole), 5):.1f}", "ms CPU"
     yield "  the next, nothing changed", f"{1e3 * _cpu_s(lambda: snapshot.refreshed(whole), 5):.1f}", "ms CPU"
+
+
+def _single_rows(snapshot: MapSnapshot, points: Floats, peer_s: float, repeats: int) -> Iterator[Row]:
+    """One point a call: from C and from Python through a handle, and from Python through the snapshot."""
+    few = points[:FEW].tolist()
+    with PointHandle(snapshot) as handle, tempfile.TemporaryDirectory() as name:
+        if shutil.which("cc") is None:
+            yield "  one point a call, from C", "skipped", "no cc (apt-get install gcc)"
+        else:
+            library, source = Path(name) / "loop.so", Path(__file__).with_name("point_loop.c")
+            options = ["-O3", "-shared", "-fPIC", f"-I{handle.HEADER.parent}", "-o", str(library)]
+            subprocess.run(["cc", *options, str(source)], check=True)
+            loop, states = ctypes.CDLL(str(library)).ask, np.empty(len(points), np.int8)
+            loop.restype = ctypes.c_double
+            state, number = ctypes.c_void_p(handle.state_address), ctypes.c_uint64(handle.map)
+            asked, answers = (ctypes.c_void_p(array.ctypes.data) for array in (points, states))
+            own_s = loop(state, number, asked, ctypes.c_int64(len(points)), answers, repeats)
+            alike = "alike" if (states == snapshot.state_at(points)).all() else "NOT ALIKE"
+            ratio = f"; OctoMap {1e6 * peer_s / len(points):.3f}: {peer_s / own_s:.1f} x as fast; answers {alike}"
+            what = f"  one point a call, from C, {len(points)}"
+            yield what, f"{1e6 * own_s / len(points):.3f}", f"us CPU each{ratio}"
+        from_python: dict[str, Callable[[], object]] = {
+            "from Python, handle": lambda: [handle.state(handle.map, *point) for point in few],
+            "from Python, snapshot": lambda: [snapshot.state_at([point]) for point in few],
+        }
+        for what, work in from_python.items():
+            yield f"  one point a call, {what}", f"{1e6 * _cpu_s(work, min(repeats, 3)) / FEW:.2f}", "us CPU each"
 
 
 def _other_rows(snapshot: MapSnapshot, points: Floats) -> Iterator[Row]:

@@ -29,7 +29,7 @@ from typing import Any
 
 import numba
 from llvmlite import binding
-from numba.core import config, dispatcher
+from numba.core import ccallback, config, dispatcher
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile, InTreeCacheLocator
 
 log = logging.getLogger(__name__)
@@ -54,6 +54,7 @@ def keep_kernels(spare: Path | None) -> None:
     """
     _Spare.folder = spare
     dispatcher.FunctionCache = KernelCache  # type: ignore[attr-defined]
+    ccallback.FunctionCache = KernelCache  # type: ignore[attr-defined]
 
 
 def home_folder() -> Path | None:
