@@ -23,6 +23,7 @@ from pathlib import Path
 
 from tests.bench.amending import amending_rows
 from tests.bench.calibration import calibration_rows
+from tests.bench.classes import class_rows
 from tests.bench.coding import coding_rows
 from tests.bench.console import console_rows
 from tests.bench.epochs import epoch_rows
@@ -30,6 +31,7 @@ from tests.bench.hot_spots import hot_spot_rows
 from tests.bench.imports import import_rows
 from tests.bench.integration import integration_rows
 from tests.bench.large_map import large_map_rows
+from tests.bench.level import level_rows
 from tests.bench.links import link_rows
 from tests.bench.live_mapping import live_mapping_rows
 from tests.bench.many_maps import many_map_rows
@@ -285,12 +287,14 @@ PARTS: dict[str, Callable[[bool], Iterator[Row]]] = {
     "amending": amending_rows,
     "live": live_mapping_rows,
     "calibration": calibration_rows,
+    "classes": class_rows,
     "coding": coding_rows,
     "console": console_rows,
     "epochs": epoch_rows,
     "hot_spots": hot_spot_rows,
     "imports": import_rows,
     "integration": integration_rows,
+    "level": level_rows,
     "links": link_rows,
     "marks": mark_rows,
     "overlay": overlay_rows,

@@ -8,12 +8,10 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 import numpy.typing as npt
-from tests.bench.level import level_rows
+from tests.bench.level import street_sweep
 from tests.bench.timing import cpu_s, wall_s
 
-from cairn_calib.rig.lidar import SpinningLidar
-from cairn_calib.rig.rig import RangeSensing, Rig, Spectrum, mount_camera
-from cairn_fusion.clouds.sweep_image import T_LIDAR_CAMERA
+from cairn_calib.rig.rig import RangeSensing, Rig
 from cairn_fusion.mapping.integrate import Integrator, Method, integrate_scans
 from cairn_fusion.mapping.measurement import Measurement
 from cairn_fusion.recording.recording import Recording, open_recording
@@ -21,7 +19,7 @@ from cairn_fusion.recording.recording_writer import RecordingWriter
 from cairn_fusion.recording.scan import Scan
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.evidence_map import EvidenceMap
-from cairn_map.evidence.grid import CellKey, Geometry, geometry_for, level_geometry
+from cairn_map.evidence.grid import CellKey, Geometry, geometry_for
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_sim.evaluation.scores import FREE, Scores, map_states, scores_of
 from cairn_sim.evaluation.truth_grid import Truth, box_of_cell, truths_of
@@ -65,7 +63,6 @@ def integration_rows(smoke: bool) -> Iterator[Row]:
     yield from _sweep_rows(smoke)
     yield from _rgbd_rows(smoke)
     if not smoke:
-        yield from level_rows()
         yield from _all_cameras_rows(plan)
         yield from _truth_rows(plan, scans)
         yield from _path_rows(plan)
@@ -156,23 +153,11 @@ def _free_by_share(truth: Truth, diff: Diff, geometry: Geometry) -> npt.NDArray[
 
 
 def _sweep_rows(smoke: bool) -> Iterator[Row]:
-    """A sweep of 64 beams in a street 80 m long, as an image of known beams and as points without order."""
-    lidar = SpinningLidar(width=1938, height=64, elevations_deg=tuple(np.linspace(2.0, -24.8, 64).round(3).tolist()))
-    rays = lidar.rays() @ T_LIDAR_CAMERA[:3, :3].T
-    low_m, high_m = np.array([-78.0, -12.0, -1.8]), np.array([78.0, 12.0, 9.0])
-    with np.errstate(divide="ignore"):
-        range_m = (np.where(rays > 0, high_m, low_m) / rays).min(axis=-1).astype(np.float32)
-    rig = Rig(name="street", cameras={RANGE_CAMERA: mount_camera(Spectrum.RANGE, lidar, T_LIDAR_CAMERA)})
-    image = Scan(time_s=0.0, T_map_rig=np.eye(4), range_camera=RANGE_CAMERA, range_m=range_m)
-    points = (lidar.rays() * range_m[..., None]).reshape(-1, 3).astype(np.float32)
+    rig, sweeps = street_sweep()
     geometry, limits = geometry_for(voxel_edge_m=0.2, channels=()), Integrator(max_range_m=80.0)
-    for name, scan in (("image", image), ("points", replace(image, points_m=points))):
-        seconds = cpu_s(lambda scan=scan: integrate_scans([scan], rig, geometry, integrator=limits), 1 if smoke else 7)
-        yield f"sweep of 64 beams, {range_m.size} points, 80 m, 20 cm, {name}", f"{1e3 * seconds:.1f}", "ms CPU"
-        level_s = cpu_s(
-            lambda scan=scan: integrate_scans([scan], rig, level_geometry(), integrator=limits), 1 if smoke else 7
-        )
-        yield "  into a level of 20 cm and 5 cm", f"{1e3 * level_s:.1f}", f"ms CPU, {level_s / seconds:.2f} x"
+    for name, scan in sweeps.items():
+        seconds = cpu_s(lambda scan=scan: integrate_scans([scan], rig, geometry, integrator=limits), 1 if smoke else 7)  # type: ignore[misc]
+        yield f"sweep of 64 beams, {scan.range_m.size} points, 80 m, 20 cm, {name}", f"{1e3 * seconds:.1f}", "ms CPU"
 
 
 def _rgbd_rows(smoke: bool) -> Iterator[Row]:

@@ -54,6 +54,23 @@ BUILDING = {
     "corridors": Route(((1.3, 0.0), (30.8, 0.0), (30.8, -8.3)), -0.1, 1.4, 0.4, (0.35, 0.55)),
 }
 YARD = {"loop": Route(((-6.0, -6.0), (5.25, -6.0), (5.25, 6.8), (-6.0, 6.8), (-6.0, -5.0)), 3.0, 2.0)}
+BRIDGE_YARD = {
+    "round": Route(
+        (
+            (-6.5, -3.0),
+            (-1.4, -3.0),
+            (-0.5, -6.0),
+            (5.25, -6.0),
+            (5.25, 6.8),
+            (-6.0, 6.8),
+            (-9.3, 5.5),
+            (-13.4, 5.5),
+        ),
+        0.7,
+        1.4,
+    ),
+    "out": Route(((-13.6, 5.5), (-9.3, 5.5), (-6.0, 4.9), (-1.6, 4.9)), 0.7, 1.3),
+}
 PATHS: Mapping[str, Mapping[str, Route]] = MappingProxyType(
     {
         "small-room": {
@@ -69,9 +86,11 @@ PATHS: Mapping[str, Mapping[str, Route]] = MappingProxyType(
         "targets": {"approach": Route(((-0.5, 0.0), (1.8, 0.0)), 1.1, 0.45)},
         "yard": YARD,
         "moving-yard": YARD,
+        "bridge-yard": BRIDGE_YARD,
     }
 )
-"""By scene and name. West and east of the small room share no stop's view but through the doorway."""
+"""By scene and name. West and east of the small room share no stop's view but through the doorway. Of the yard with the
+bridge, `round` ends in the shed and `out` begins there."""
 
 
 def path_names(scene: str) -> list[str]:

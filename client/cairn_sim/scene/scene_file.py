@@ -101,7 +101,7 @@ from cairn_sim.scene.scene_format import (
 from cairn_sim.scene.solids import Angles3, Box, Cylinder, Plane, Shape, Solid, Sphere, placed
 from cairn_sim.scene.surfaces import Material, Optics, Rgb, Surface
 
-SHIPPED = ("building", "small-room", "yard", "moving-building", "moving-yard")
+SHIPPED = ("building", "small-room", "yard", "moving-building", "moving-yard", "bridge-yard")
 """Names of the scenes that come with cairn."""
 FILE_BYTES_MAX = 1 << 20
 DOTS_MAX = 64

@@ -1,8 +1,9 @@
 """The yard as a level against its truth: heights of the open ground, and an honest sigma."""
 
-from tests.fixtures.sim.ground_truth import ground_errors, mapped, scans_of_yard
+from tests.fixtures.sim.yard import mapped, scans_of_yard
 
 from cairn_map.queries.map_snapshot import snapshot_of
+from cairn_sim.evaluation.ground_truth import ground_errors
 from cairn_sim.robots.record import Plan
 from cairn_sim.robots.robots import ROBOTS
 from cairn_sim.scene.scene_file import load_scene

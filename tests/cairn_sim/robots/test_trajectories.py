@@ -129,8 +129,10 @@ def test_what_moves_keeps_clear_of_all_paths_at_all_times(scene_name: str) -> No
     heights_m = np.linspace(BODY_M + 0.05, 1.1, 6)
     at = np.array([(T @ [0, 0, height_m, 1])[:3] for T in poses for height_m in heights_m])
     keyframes_s = {key.time_s for each in scene.moving for key in each.movement.keyframes}
-    for after_s in sorted(keyframes_s | {float(s) for s in range(24)} | {1801.0, 1802.0, 1803.0, 3601.0, 3602.0}):
-        assert scene.at(CLOCK_START_S + after_s).distance_m(at).min() > BODY_M - 0.05, after_s
+    times_s = sorted(keyframes_s | {float(s) for s in range(24)} | {1801.0, 1802.0, 1803.0, 3601.0, 3602.0})
+    # While nothing moves it is the very same scene, asked once.
+    for now, after_s in {scene.at(CLOCK_START_S + after_s): after_s for after_s in times_s}.items():
+        assert now.distance_m(at).min() > BODY_M - 0.05, after_s
 
 
 def test_the_papers_experiment_has_its_54_stops_as_far_apart_as_printed() -> None:
