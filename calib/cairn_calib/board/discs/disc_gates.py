@@ -47,6 +47,8 @@ BEYOND_SHARE = 0.5
 SQUARES_SHARE, HALF_WAY = 0.9, 0.08
 """Share of the places next to a board's rim that are as dark as discs where these are squares of a chessboard; and by
 how much its corners, half-way between two squares of one colour, may differ from the mean of both colours."""
+ALIKE = 0.3
+"""Largest difference from the discs of a board, or from its ground, of what counts as one beyond its rim, contrasts."""
 DISC_PITCHES = (0.25, 1.0)
 """Diameter of a disc, pitches (of asymmetric circles: distances of neighbours)."""
 
@@ -204,11 +206,15 @@ def refusal(found: GridFit, named: NamedDiscs) -> tuple[str, str] | None:
     return place_refusal(board, found.in_view, named)
 
 
-def squares_refusal(dark: Image, found: GridFit) -> tuple[str, str] | None:
-    """The gate that refuses squares of a chessboard that are too small to have corners, and why; None of discs.
+def rim_refusal(dark: Image, found: GridFit) -> tuple[str, str] | None:
+    """The gate that refuses a grid by the image beyond its rim, and why; None where it may be a whole board.
 
-    The outer squares run into the margin of their board, so that the lattice ends there, but what is beyond its rim is
-    as dark as they are. In between are corners: the mean of both colours, however blurred the image is.
+    Squares of a chessboard that are too small to have corners: the outer ones run into the margin of their board, so
+    that the lattice ends there, but what is beyond its rim is as dark as they are. In between are corners: the mean of
+    both colours, however blurred the image is.
+
+    Discs of a larger pattern: beyond the rim lies another one with ground on all four sides, whether it made a blob or
+    not.
     """
     board, step = found.board, neighbour_step(found.board)
     known, pixels = board.lattice()[found.kept], found.pixels[found.kept]
@@ -219,24 +225,34 @@ def squares_refusal(dark: Image, found: GridFit) -> tuple[str, str] | None:
     is_disc = (np.abs(near[:, None] - board.lattice()).max(axis=2) < 1e-6).any(axis=1)
     ground = (known[:, None] + (sides + np.roll(sides, 1, axis=0)) / 2).reshape(-1, 2)
     half_way = np.repeat(known, len(sides), axis=0)[is_disc] + np.tile(sides, (len(known), 1))[is_disc] / 2
+    outer = np.unique(near[~is_disc], axis=0)
+    outside = (outer[:, None] + sides / 2).reshape(-1, 2)
     values = [
         _counts_at(dark, local_map(known, pixels, places, step=step)[0])
-        for places in (known, ground, half_way, near[~is_disc])
+        for places in (known, ground, half_way, outer, outside)
     ]
-    if any(not len(each) for each in values):
+    if any(np.isnan(each).all() for each in values[:4]):
         return None
-    disc, between = float(np.median(values[0])), float(np.median(values[1]))
-    corner, beyond = ((each - between) / (disc - between) if disc != between else each * 0 for each in values[2:])
-    if (beyond > 0.5).mean() < SQUARES_SHARE or abs(float(np.median(corner)) - 0.5) > HALF_WAY:
+    disc, between = float(np.nanmedian(values[0])), float(np.nanmedian(values[1]))
+    # 0 as the ground, 1 as a disc; NaN beyond the image, of which each comparison is false.
+    if disc == between:
         return None
-    return "rims", "what lies beyond the board's rim is like its discs: of a chessboard leave out --pattern"
+    corner, beyond, around = ((each - between) / (disc - between) for each in values[2:])
+    is_corner = abs(float(np.nanmedian(corner)) - 0.5) <= HALF_WAY
+    if is_corner and (beyond[~np.isnan(beyond)] > 0.5).mean() >= SQUARES_SHARE:
+        return "rims", "what lies beyond the board's rim is like its discs: of a chessboard leave out --pattern"
+    is_alone = (np.abs(around.reshape(-1, len(sides))) < ALIKE).all(axis=1)
+    more = int((is_alone & (np.abs(beyond - 1) < ALIKE)).sum())
+    return _goes_on(more) if more > beyond_max(board) else None
 
 
 def _counts_at(image: Image, pixels: Floats) -> Floats:
-    """Counts of the nearest pixels to those of (N, 2) that lie in an image."""
+    """(N,) counts of the nearest pixels to (N, 2) places; NaN beyond the image."""
     x, y = np.rint(pixels).astype(np.intp).T
     inside = (x >= 0) & (y >= 0) & (x < image.shape[1]) & (y < image.shape[0])
-    return np.asarray(image[y[inside], x[inside]], np.float64)
+    counts = np.full(len(pixels), np.nan)
+    counts[inside] = image[y[inside], x[inside]]
+    return counts
 
 
 def beyond_max(board: Board) -> float:
@@ -257,11 +273,15 @@ def place_refusal(board: Board, in_view: Flags, named: NamedDiscs) -> tuple[str,
             "show at least one end of its rows and one of its columns"
         )
     if named.beyond > beyond_max(board):
-        return "rims", (
-            f"{named.beyond} more discs lie next to the board's rim in the same lattice: state the whole board with "
-            "--board, or cover what is not of it; of a chessboard leave out --pattern"
-        )
+        return _goes_on(named.beyond)
     return None
+
+
+def _goes_on(beyond: int) -> tuple[str, str]:
+    return "rims", (
+        f"{beyond} more discs lie next to the board's rim in the same lattice: state the whole board with --board, or "
+        "cover what is not of it; of a chessboard leave out --pattern"
+    )
 
 
 def _too_few_in_view(whole: int, board: Board) -> tuple[str, str]:

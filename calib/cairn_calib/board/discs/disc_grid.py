@@ -27,8 +27,8 @@ from cairn_calib.board.discs.disc_gates import (
     neighbour_step,
     place_refusal,
     refusal,
+    rim_refusal,
     seen_min,
-    squares_refusal,
     too_few_seen,
 )
 from cairn_calib.board.discs.disc_lattice import (
@@ -153,7 +153,7 @@ def _best_named(
     found = fit_grid(dark, expected, least=seen_min(in_view))
     if found is None:
         return too_few_seen(f"at most {seen_min(in_view) - 1}", in_view)
-    return refusal(found, best) or squares_refusal(dark, found) or found
+    return refusal(found, best) or rim_refusal(dark, found) or found
 
 
 def _seen_text(found: GridFit) -> str:

@@ -11,7 +11,7 @@ from tests.fixtures.calib.board_images import DISCS, TOF, picture, pose
 from cairn_calib.board.board import Board
 from cairn_calib.board.discs import disc_outline
 from cairn_calib.board.discs.blobs import dark_blobs
-from cairn_calib.board.discs.disc_gates import is_regular, seen_min
+from cairn_calib.board.discs.disc_gates import is_regular, rim_refusal, seen_min
 from cairn_calib.board.discs.disc_grid import find_circles
 from cairn_calib.board.discs.disc_lattice import NamedDiscs, Place, has_room, name_discs, walks
 from cairn_calib.board.discs.grid_outlines import expect_grid, fit_grid
@@ -47,6 +47,25 @@ def test_squares_too_small_to_have_corners_are_no_discs(edge_px: int, blur_px: f
     detection = find_circles(small_chessboard(edge_px, blur_px), board, polarity="reversed")
     assert detection.corners is None
     assert any("like its discs: of a chessboard" in each.reason for each in detection.attempts)
+
+
+@pytest.mark.parametrize(("columns", "rows", "more"), [(4, 3, 0), (6, 5, 14), (5, 4, 7)])
+def test_discs_beyond_the_rim_that_made_no_blob_make_a_board_part_of_a_larger_pattern(
+    columns: int, rows: int, more: int
+) -> None:
+    image = ceiling(columns, rows).astype(np.float32)
+    blobs = dark_blobs(image, 6.4)
+    # 4 x 3 holes of a plate are taken for the board; on the left, above and so on the plate may have another row.
+    first = 30.0 + 20.0 * np.array([columns > 4, rows > 3])
+    centres = first + 20.0 * BOARD.lattice()
+    own = np.array([int(np.linalg.norm(blobs.centres - each, axis=1).argmin()) for each in centres])
+    expected = expect_grid(BOARD, blobs, NamedDiscs(own, 0), image.shape)
+    assert expected is not None
+    found = fit_grid(image, expected)
+    assert found is not None
+    assert found.kept.all()
+    refused = rim_refusal(image, found)
+    assert (refused[1].split()[0] if refused else "0") == str(more)
 
 
 @pytest.fixture
