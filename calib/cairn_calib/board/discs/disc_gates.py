@@ -47,8 +47,15 @@ BEYOND_SHARE = 0.5
 SQUARES_SHARE, HALF_WAY = 0.9, 0.08
 """Share of the places next to a board's rim that are as dark as discs where these are squares of a chessboard; and by
 how much its corners, half-way between two squares of one colour, may differ from the mean of both colours."""
-ALIKE = 0.3
-"""Largest difference from the discs of a board, or from its ground, of what counts as one beyond its rim, contrasts."""
+GROUND_SAMPLES, NEAR_RADII, NEAR_STEPS = 7, 1.1, 0.08
+"""Samples along each side between four discs; those nearer to a disc than so many radii and steps may be blurred."""
+DARK_LEAST, DARK_MOST, DARK_DISCS = 0.06, 0.2, 0.5
+"""Share of the ground between four discs that may be as dark as they are: that of half a disc, within bounds."""
+ALIKE, ALONE = 0.3, 0.35
+"""Of what counts as one more disc beyond a board's rim: the largest difference from its discs, and the least from each
+place half-way to a neighbour, contrasts."""
+OUTER_SHARE = 0.25
+"""Share of the places next to a board's rim, wholly in view, that may have one; clutter is at some."""
 DISC_PITCHES = (0.25, 1.0)
 """Diameter of a disc, pitches (of asymmetric circles: distances of neighbours)."""
 
@@ -213,8 +220,7 @@ def rim_refusal(dark: Image, found: GridFit) -> tuple[str, str] | None:
     that the lattice ends there, but what is beyond its rim is as dark as they are. In between are corners: the mean of
     both colours, however blurred the image is.
 
-    Discs of a larger pattern: beyond the rim lies another one with ground on all four sides, whether it made a blob or
-    not.
+    Discs of a larger pattern: beyond the rim lie others, whether they made blobs or not.
     """
     board, step = found.board, neighbour_step(found.board)
     known, pixels = board.lattice()[found.kept], found.pixels[found.kept]
@@ -234,16 +240,54 @@ def rim_refusal(dark: Image, found: GridFit) -> tuple[str, str] | None:
     if any(np.isnan(each).all() for each in values[:4]):
         return None
     disc, between = float(np.nanmedian(values[0])), float(np.nanmedian(values[1]))
-    # 0 as the ground, 1 as a disc; NaN beyond the image, of which each comparison is false.
     if disc == between:
         return None
+    # 0 as the ground, 1 as a disc; NaN beyond the image, of which each comparison is false.
     corner, beyond, around = ((each - between) / (disc - between) for each in values[2:])
     is_corner = abs(float(np.nanmedian(corner)) - 0.5) <= HALF_WAY
     if is_corner and (beyond[~np.isnan(beyond)] > 0.5).mean() >= SQUARES_SHARE:
         return "rims", "what lies beyond the board's rim is like its discs: of a chessboard leave out --pattern"
-    is_alone = (np.abs(around.reshape(-1, len(sides))) < ALIKE).all(axis=1)
-    more = int((is_alone & (np.abs(beyond - 1) < ALIKE)).sum())
-    return _goes_on(more) if more > beyond_max(board) else None
+    whole = np.column_stack([beyond, around.reshape(-1, len(sides))])
+    whole = whole[~np.isnan(whole).any(axis=1)]
+    more = int(((np.abs(whole[:, 0] - 1) < ALIKE) & (whole[:, 1:] < 1 - ALONE).all(axis=1)).sum())
+    return _goes_on(more) if more > max(beyond_max(board), OUTER_SHARE * len(whole)) else None
+
+
+def ground_refusal(dark: Image, found: GridFit) -> tuple[str, str] | None:
+    """The gate that refuses a grid with other things like its discs between them, and why; None where it is a board.
+
+    So are every other hole of a perforated plate, and keys of a keyboard that lie a knight's move from each other.
+    """
+    step, lattice = neighbour_step(found.board), found.board.lattice()
+    # Four discs around each piece of ground, by their places.
+    across, down = np.array([(1, 1), (-1, 1)] if step > 1 else [(1, 0), (0, 1)])
+    at_place = {(round(x), round(y)): n for n, (x, y) in enumerate(lattice.tolist()) if found.kept[n]}
+    corners = [
+        [at_place.get((round(x), round(y)), -1) for x, y in place + np.array([0 * across, across, down, across + down])]
+        for place in lattice
+    ]
+    fours = np.array([four for four in corners if min(four) >= 0])
+    # Samples between them, but for the discs themselves and the blur of their edges.
+    a, b = np.stack(np.meshgrid(*[(np.arange(GROUND_SAMPLES) + 0.5) / GROUND_SAMPLES] * 2)).reshape(2, -1)
+    near = np.hypot(np.minimum(a, 1 - a), np.minimum(b, 1 - b))
+    radius = disc_pitches(found) / (2 * step)
+    is_ground = near > NEAR_RADII * radius + NEAR_STEPS
+    if not len(fours) or is_ground.sum() < GROUND_SAMPLES:
+        return None
+    places = lattice[fours[:, 0], None] + a[is_ground, None] * across + b[is_ground, None] * down
+    pixels, _ = local_map(lattice[found.kept], found.pixels[found.kept], places.reshape(-1, 2), step=step)
+    counts = _counts_at(dark, pixels).reshape(len(fours), -1)
+    disc = _counts_at(dark, found.pixels[fours.ravel()]).reshape(fours.shape).mean(axis=1)
+    # Of each four: light and heat may change over a board.
+    usual = np.median([each.contrast for each, kept in zip(found.fits, found.kept, strict=True) if kept and each])
+    ground = np.maximum(np.nanpercentile(counts, 90, axis=1), disc + usual / 2)
+    share = float(np.median((counts < (disc + ground)[:, None] / 2).mean(axis=1)))
+    if share <= np.clip(DARK_DISCS * np.pi * radius**2 / is_ground.mean(), DARK_LEAST, DARK_MOST):
+        return None
+    return "ground", (
+        f"of the ground between four of them {share:.0%} is as they are: state the whole board with --board, or cover "
+        "what is not of it"
+    )
 
 
 def _counts_at(image: Image, pixels: Floats) -> Floats:

@@ -23,6 +23,7 @@ from cairn_calib.board.discs.disc_gates import (
     DISCS_MIN,
     GridFit,
     disc_pitches,
+    ground_refusal,
     is_regular,
     neighbour_step,
     place_refusal,
@@ -153,7 +154,7 @@ def _best_named(
     found = fit_grid(dark, expected, least=seen_min(in_view))
     if found is None:
         return too_few_seen(f"at most {seen_min(in_view) - 1}", in_view)
-    return refusal(found, best) or rim_refusal(dark, found) or found
+    return refusal(found, best) or rim_refusal(dark, found) or ground_refusal(dark, found) or found
 
 
 def _seen_text(found: GridFit) -> str:

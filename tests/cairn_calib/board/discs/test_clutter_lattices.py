@@ -11,7 +11,7 @@ from tests.fixtures.calib.board_images import DISCS, TOF, picture, pose
 from cairn_calib.board.board import Board
 from cairn_calib.board.discs import disc_outline
 from cairn_calib.board.discs.blobs import dark_blobs
-from cairn_calib.board.discs.disc_gates import is_regular, rim_refusal, seen_min
+from cairn_calib.board.discs.disc_gates import ground_refusal, is_regular, rim_refusal, seen_min
 from cairn_calib.board.discs.disc_grid import find_circles
 from cairn_calib.board.discs.disc_lattice import NamedDiscs, Place, has_room, name_discs, walks
 from cairn_calib.board.discs.grid_outlines import expect_grid, fit_grid
@@ -66,6 +66,21 @@ def test_discs_beyond_the_rim_that_made_no_blob_make_a_board_part_of_a_larger_pa
     assert found.kept.all()
     refused = rim_refusal(image, found)
     assert (refused[1].split()[0] if refused else "0") == str(more)
+
+
+@pytest.mark.parametrize("pitch", [1, 2])
+def test_every_other_hole_of_a_plate_is_no_board(pitch: int) -> None:
+    image = ceiling(12, 9).astype(np.float32)
+    blobs = dark_blobs(image, 6.4)
+    centres = 30.0 + 20.0 * pitch * BOARD.lattice()
+    own = np.array([int(np.linalg.norm(blobs.centres - each, axis=1).argmin()) for each in centres])
+    expected = expect_grid(BOARD, blobs, NamedDiscs(own, 0), image.shape)
+    assert expected is not None
+    found = fit_grid(image, expected)
+    assert found is not None
+    assert found.kept.all()
+    refused = ground_refusal(image, found)
+    assert (refused is not None) == (pitch > 1)
 
 
 @pytest.fixture
