@@ -21,7 +21,7 @@ from cairn_fusion.mapping.ray_casting import unique_voxels
 from cairn_fusion.mapping.samples import ImageTransfers
 from cairn_fusion.recording.scan import LabelNames, Scan
 from cairn_fusion.transfer.transfer import Label
-from cairn_map.arrays import Ints
+from cairn_map.arrays import Ints, Words32
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.channels import OTHER, VOTE_MAX, Channel, ChannelKind
 from cairn_map.evidence.evidence import Evidence, packed_evidence
@@ -136,7 +136,7 @@ class ClassVotes:
             for cell, rows in zip(cells.tolist(), np.split(order, starts[1:]), strict=True)
         }
 
-    def _of_cell(self, places: Ints, winners: Ints, weights: Ints, channel: Channel) -> Evidence:
+    def _of_cell(self, places: Words32, winners: Ints, weights: Ints, channel: Channel) -> Evidence:
         """Votes in one cell, several for a voxel where several cameras saw it."""
         voxels, row_of = np.unique(places, return_inverse=True)
         planes = self._geometry.planes_of(channel.name)

@@ -107,10 +107,11 @@ def labels_of(image: AnyImage, name: str) -> npt.NDArray[np.uint8 | np.uint16]:
     numbers = _raw(image, LABELS, name)
     if numbers.dtype == np.uint8:
         return numbers.astype(np.uint8, copy=False)
-    strange = numbers[(numbers < 0) | (numbers > LABEL_MAX)]
+    wide = numbers.astype(np.int32)
+    strange = wide[(wide < 0) | (wide > LABEL_MAX)]
     if len(strange):
         raise BadInputError("unknown_label", f"{name} holds {strange[0]}; labels are numbers from 0 to {LABEL_MAX}")
-    return numbers.astype(np.uint16)
+    return wide.astype(np.uint16)
 
 
 def colour_of(image: AnyImage, name: str) -> npt.NDArray[np.uint8]:

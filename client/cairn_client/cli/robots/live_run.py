@@ -74,6 +74,7 @@ def run_live(args: argparse.Namespace) -> int:
                 stay=args.stay,
                 keep_scans_bytes=kept_bytes,
             )
+            _check_classes(robot, mapping)
         except CairnError as exc:
             if source is not None:
                 source.close()
@@ -91,15 +92,29 @@ def _corrections(mapping: BagMapping, opened: OpenedLive, robot: Robot) -> PathC
     return PathCorrections(robot, topic=given.topic, frame=frame, T_path_rig=opened.T_path_rig)
 
 
-def _layer_of(args: argparse.Namespace, mapping: BagMapping) -> MapLayer:
-    """The map's layer, made if that is asked for.
+def _layer_of(args: argparse.Namespace, mapping: BagMapping) -> MapLayer | None:
+    """The map's layer, made if that is asked for; None without a link: the state folder may know it.
 
     Raises:
         BadInputError: kind `unknown_class`: the labels have names that the layer's classes lack.
     """
     layer = ensure_map(args, lambda: _channels(mapping))
-    check_label_names(mapping.label_names, layer.geometry)
+    if layer is not None:
+        check_label_names(mapping.label_names, layer.geometry)
     return layer
+
+
+def _check_classes(robot: Robot, mapping: BagMapping) -> None:
+    """Close a robot whose map, which its folder knew, has other classes than the labels.
+
+    Raises:
+        BadInputError: kind `unknown_class`.
+    """
+    try:
+        check_label_names(mapping.label_names, robot.replica.geometry)
+    except BadInputError:
+        robot.close()
+        raise
 
 
 def _channels(mapping: BagMapping) -> tuple[Channel, ...]:

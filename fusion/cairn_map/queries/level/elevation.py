@@ -150,21 +150,12 @@ def elevation_of(
         count,
         obstacle,
     )
-    # Stage 3: what the neighbours say, by tiles: the sums of a pixel's plane take 200 bytes. Arrays that are there
-    # already become those of the answer.
+    # Stage 3: what the neighbours say. Arrays that are there already become those of the answer.
     height_m, sigma_m, obstacle_m = (each.reshape(H, W) for each in (height, variance, obstacle))
     for metres in (height_m, obstacle_m):
         metres /= 1e3
     obstacle_m[np.isnan(height_m)] = np.nan
-    slope, roughness, step = (np.empty((H, W)) for _ in range(3))
-    for tile, bordered, inner in _tiles(H, W):
-        around = _around(height_m[bordered], geometry.voxel_edge_m)
-        for whole, part in zip((slope, roughness, step), around, strict=True):
-            whole[tile] = part[inner]
-        spread2 = sigma_m[tile] / 1e6 + (VOTE_SPREAD * step_mm / 1e3) ** 2
-        rise_m = np.nan_to_num(np.tan(slope[tile])) * geometry.voxel_edge_m
-        votes_of = np.maximum(count.reshape(H, W)[tile], 1)
-        sigma_m[tile] = np.sqrt(spread2 / votes_of + SIGMA_MIN_M**2 + (SLOPE_SHARE * rise_m) ** 2)
+    slope, roughness, step = _surroundings_into(height_m, count.reshape(H, W), sigma_m, geometry)
     x, y = ((int(number) * 2 + 1) * geometry.voxel_edge_um / 2e6 for number in low[:2])
     return Elevation(
         height_m=height_m,
@@ -201,6 +192,24 @@ def _voxels(
         np.concatenate([each[3] for each in found]),
         np.concatenate([each[4] for each in found]),
     )
+
+
+def _surroundings_into(
+    height_m: Floats, votes: Ints, sigma_m: Floats, geometry: Geometry
+) -> tuple[Floats, Floats, Floats]:
+    """Slope, roughness and step of each column; `sigma_m` holds variances of votes, mm2, then uncertainties, metres.
+
+    All of it is made by tiles: the sums of a column's plane take 200 bytes.
+    """
+    found = slope, roughness, step = np.empty(height_m.shape), np.empty(height_m.shape), np.empty(height_m.shape)
+    for tile, bordered, inner in _tiles(*height_m.shape):
+        for whole, part in zip(found, _around(height_m[bordered], geometry.voxel_edge_m), strict=True):
+            whole[tile] = part[inner]
+        spread2 = sigma_m[tile] / 1e6 + (VOTE_SPREAD * geometry.voxel_height_m) ** 2
+        rise_m = np.nan_to_num(np.tan(slope[tile])) * geometry.voxel_edge_m
+        sigma2 = spread2 / np.maximum(votes[tile], 1) + SIGMA_MIN_M**2 + (SLOPE_SHARE * rise_m) ** 2
+        sigma_m[tile] = np.sqrt(sigma2)
+    return slope, roughness, step
 
 
 def _tiles(H: int, W: int) -> Iterator[tuple[Part, Part, Part]]:
