@@ -221,8 +221,8 @@ export class Console {
   }
 
   setField(field: Field): void {
+    if (!fieldsOf(this.info.geometry).some((one) => one.field === field)) return;
     this.look.field = field;
-    this.check();
     this.apply();
   }
 

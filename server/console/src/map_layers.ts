@@ -1,6 +1,6 @@
 /** Layers of a map as the page names them: MAP.LAYER in paths, and what kind of layer each is. */
 
-import type { Channel, MapInfo } from "./messages.ts";
+import type { Channel, Geometry, MapInfo, Triple } from "./messages.ts";
 import { metres } from "./units.ts";
 
 /** The layer that a map begins with, which has no name in paths. */
@@ -18,6 +18,11 @@ export function layerText({ name, geometry }: MapInfo): string {
   if (geometry.height_step_um !== undefined) return `${layer}: level, ${edge}`;
   const count = classesOf(geometry.channels).length;
   return count ? `${layer}: ${count} classes, ${edge}` : `${layer}: ${edge}`;
+}
+
+/** Size of a voxel, m. */
+export function voxelSizeOf({ voxel_edge_um, height_step_um }: Geometry): Triple {
+  return [voxel_edge_um / 1e6, voxel_edge_um / 1e6, (height_step_um ?? voxel_edge_um) / 1e6];
 }
 
 /** Names of the classes in whose colours a map is drawn: it counts them, and has no colour camera. */

@@ -19,6 +19,8 @@ const CLEARANCE_M = 1.5;
 const PLANE_MIN = 5;
 /** Surfaces are drawn down to the lowest one around, but not as deep as this, m: below is another surface, or a hole. */
 const FALL_MAX_M = 0.6;
+/** For so long ground is found at a time; the next tick goes on. All that a page without a graphics card shows takes 0.2 s. */
+const WRITE_MS = 30;
 const NEIGHBOURS = Array.from({ length: 27 }, (_, n) => [(n % 3) - 1, (Math.floor(n / 3) % 3) - 1, Math.floor(n / 9) - 1] as const);
 
 /** Surfaces of one cell by column: the first row of each, -1 for none, and the row after it. */
@@ -55,6 +57,7 @@ export class Ground {
   tick(): void {
     if (!this.cells.isLevel || this.seen === this.cells.shows) return;
     this.seen = this.cells.shows;
+    const endMs = performance.now() + WRITE_MS;
     let isOther = false;
     for (const cell of this.cells.all.values()) {
       if (!cell.points) continue;
@@ -64,6 +67,10 @@ export class Ground {
       });
       const before = this.madeOf.get(cell);
       if (before && around.every((bytes, n) => bytes === before[n])) continue;
+      if (performance.now() > endMs) {
+        this.seen = -1;
+        break;
+      }
       this.madeOf.set(cell, around);
       this.write(cell, around);
       isOther = true;
