@@ -1,4 +1,4 @@
-"""Laws of the page's modules that need no browser: moments of a log, a log that is read far back, addresses, pictures' heads."""
+"""Laws of the page's modules that need no browser: moments, logs that are read far back, addresses, pictures' heads."""
 
 import json
 import subprocess
@@ -8,6 +8,9 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+
+from cairn_map.evidence.channels import CLASSES_MAX, OTHER_GREY, class_colours
+from cairn_map.evidence.view import PALE_PARTS
 
 pytestmark = pytest.mark.browser
 
@@ -46,6 +49,13 @@ def said(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 def test_moments_logs_and_addresses_keep_their_laws(said: dict[str, Any]) -> None:
     assert said["said"]["wrong"] == []
+
+
+def test_classes_have_the_colours_of_the_server(said: dict[str, Any]) -> None:
+    colours = class_colours(CLASSES_MAX)
+    assert said["said"]["classes"] == colours.tolist()
+    pale = (colours + PALE_PARTS * float(OTHER_GREY)) / (1 + PALE_PARTS)
+    assert said["said"]["pale"] == np.rint(pale).astype(int).tolist()
 
 
 def test_the_size_of_a_picture_is_read_from_its_head(said: dict[str, Any]) -> None:

@@ -1,6 +1,7 @@
 /** Laws of the page's modules that need no browser, for a test: what breaks one is printed; sizes of the pictures that are named, too. */
 
 import { readFileSync } from "node:fs";
+import { classColours, classOf, unsureColour } from "../src/class_colours.ts";
 import { fromHash } from "../src/look.ts";
 import type { LogEntry } from "../src/messages.ts";
 import { sizeOf } from "../src/picture_size.ts";
@@ -61,4 +62,7 @@ for (const text of ["1e20", "-1e20", "1e12", "NaN", "Infinity", ""]) {
 }
 law("a time of this century is one", fromHash("#map=a&at=1760000040.5").look.atS === 1760000040.5);
 
-console.log(JSON.stringify({ wrong: [...new Set(wrong)], sizes: process.argv.slice(2).map((path) => sizeOf(new Uint8Array(readFileSync(path)))) }));
+const classes = classColours(64);
+law("a class is told by its colour, and by its paler one", classes.every((colour, n) => classOf(colour, 64)?.number === n && classOf(unsureColour(colour), 64)?.number === n));
+
+console.log(JSON.stringify({ classes, pale: classes.map(unsureColour), wrong: [...new Set(wrong)], sizes: process.argv.slice(2).map((path) => sizeOf(new Uint8Array(readFileSync(path)))) }));

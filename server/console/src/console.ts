@@ -9,11 +9,12 @@ import { FindingsDesk } from "./findings_desk.ts";
 import { Heights } from "./heights.ts";
 import { KeptAddress } from "./kept_address.ts";
 import { LogBook } from "./log_book.ts";
-import { toHash, type CameraView, type Field, type Look } from "./look.ts";
+import { fieldsOf, toHash, type CameraView, type Field, type Look } from "./look.ts";
 import { MapFeed } from "./map_feed.ts";
 import type { MapInfo, Triple } from "./messages.ts";
 import { rgbOf, robotColour } from "./palettes.ts";
 import { Cells } from "./scene/cells.ts";
+import { Ground } from "./scene/ground.ts";
 import { CellGrid, Outline } from "./scene/lines.ts";
 import { Picker } from "./scene/picking.ts";
 import { Spread } from "./scene/spread.ts";
@@ -64,6 +65,7 @@ export class Console {
   readonly appearance: Appearance;
   readonly spread: Spread;
   readonly heights: Heights;
+  readonly ground: Ground;
   private readonly api: Api;
   private readonly info: MapInfo;
   private readonly look: Look;
@@ -93,10 +95,11 @@ export class Console {
     this.info = info;
     this.look = look;
     this.bar = bar;
+    this.check();
     const host = h("div", { class: "host" });
     this.book = new LogBook(api, info.name);
     this.duties = new Duties(api, info.name);
-    this.voxel = new VoxelPanel(api, info.name, look, (seq) => this.book.robotAt(seq));
+    this.voxel = new VoxelPanel(api, info, look, (seq) => this.book.robotAt(seq));
     this.takeAway = new TakeAwayPanel(api, info, look);
     this.panel = new LookPanel(look);
     this.cells = new Cells(api, info);
@@ -124,6 +127,8 @@ export class Console {
     view.append(this.time.comparison.panel.element);
     this.spread = new Spread(api, info.name);
     this.heights = new Heights(look, this.cells, this.spread);
+    this.ground = new Ground(this.cells);
+    this.ground.onChange = () => this.stage.draw();
     this.team = new Team(api, info.name, this.labels, this.stage, this.cells);
     view.append(h("div", { class: "through" }, this.team.picture.element, this.team.fromPose.element));
     this.picker = new Picker(this.stage, this.cells);
@@ -142,7 +147,7 @@ export class Console {
     this.stage.add(this.findings.pins.group);
     view.append(this.findings.pins.element, this.findings.alarm.banner);
     left.append(this.dutyPanel.element, this.findings.panel.element, this.camera.element, this.team.panel.element, mapFacts(info));
-    this.appearance = new Appearance(look, this.stage, this.cells, this.book, this.spread);
+    this.appearance = new Appearance(info, look, this.stage, this.cells, this.book, this.spread);
     view.append(this.appearance.legend.element);
     this.plan = new PlanPanel(this.stage, this.cells, this.heights, {
       ink: () => this.appearance.planInk, findings: () => this.findings.all, robots: () => this.team.places,
@@ -184,6 +189,7 @@ export class Console {
   /** Show what another address of this map says: a link, or Back. */
   take(look: Look, camera: CameraView | null): void {
     Object.assign(this.look, look, { boxes: look.boxes ?? this.look.boxes });
+    this.check();
     this.heights.forget();
     this.time.follow();
     this.team.follow(null);
@@ -215,8 +221,15 @@ export class Console {
   }
 
   setField(field: Field): void {
+    if (!fieldsOf(this.info.geometry).some((one) => one.field === field)) return;
     this.look.field = field;
     this.apply();
+  }
+
+  /** A field that this map does not have gives way to the one that it is opened with. */
+  private check(): void {
+    const fields = fieldsOf(this.info.geometry);
+    if (!fields.some(({ field }) => field === this.look.field)) this.look.field = fields[0]!.field;
   }
 
   step(up: boolean): void {
@@ -258,7 +271,7 @@ export class Console {
     this.takeAway.choose(picked?.cell.key ?? null);
     if (!picked) return this.askNothing();
     this.shelf.open("voxel");
-    void this.voxel.show(picked, this.cells.depthMax, this.heights.floorM);
+    void this.voxel.show(picked, this, this.heights.floorM);
   }
 
   private askNothing(): void {
@@ -398,7 +411,8 @@ export class Console {
     }
     if (this.feed.cursor) this.spread.tick(this.cells.head);
     // Of a past moment heights are told as of now: the picture stays comparable.
-    if (this.look.atS === null || !this.heights.storeys.floorsM.length) this.heights.tick();
+    if (!this.cells.isLevel && (this.look.atS === null || !this.heights.storeys.floorsM.length)) this.heights.tick();
+    this.ground.tick();
     this.camera.settle();
     this.kept.tick(this.camera.isPlaced && !this.stage.isFlying);
     const bounds = this.cells.tightBounds;

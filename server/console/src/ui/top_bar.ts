@@ -2,7 +2,8 @@
 
 import { fill, h } from "../dom.ts";
 import type { LinkState } from "../live.ts";
-import { FIELDS, type Field } from "../look.ts";
+import { fieldsOf, type Field } from "../look.ts";
+import { layerText, mapOf } from "../map_layers.ts";
 import type { MapInfo } from "../messages.ts";
 import { isClockTrusted } from "../server_time.ts";
 import { ago } from "../units.ts";
@@ -18,22 +19,31 @@ export class TopBar {
   private readonly field: HTMLSelectElement;
   private readonly link = h("span", { class: "link", role: "status" });
 
-  constructor(maps: readonly MapInfo[], map: string, loggedIn: boolean, on: { map: (name: string) => void; keys: () => void; share: () => void; logOut: () => void }) {
-    const choice = h("select", { "aria-label": "Map" }, ...maps.map(({ name }) => h("option", { value: name, selected: name === map }, name)));
-    choice.addEventListener("change", () => on.map(choice.value));
+  constructor(maps: readonly MapInfo[], { name: map, geometry }: MapInfo, loggedIn: boolean, on: { map: (name: string) => void; keys: () => void; share: () => void; logOut: () => void }) {
+    const chooser = (label: string, options: readonly [string, string][], chosen: string) => {
+      const made = h("select", { "aria-label": label }, ...options.map(([name, text]) => h("option", { value: name, selected: name === chosen }, text)));
+      made.addEventListener("change", () => on.map(made.value));
+      return made;
+    };
+    const own = mapOf(map);
+    const layers = maps.filter(({ name }) => mapOf(name) === own);
+    const names = [...new Set(maps.map(({ name }) => mapOf(name)))];
+    const choice = chooser("Map", names.map((name) => [name, name]), own);
+    const layer = layers.length > 1 ? chooser("Layer", layers.map((one) => [one.name, layerText(one)]), map) : null;
+    const fields = fieldsOf(geometry);
     this.fields = h(
       "div", { class: "segments", role: "group", "aria-label": "Colour by" },
-      ...FIELDS.map(({ field, label }) =>
+      ...fields.map(({ field, label }) =>
         h("button", { type: "button", "data-field": field, onclick: () => this.onField(field) }, label),
       ),
     );
-    this.field = h("select", { class: "field", "aria-label": "Colour by" }, ...FIELDS.map(({ field, label }) => h("option", { value: field }, label)));
+    this.field = h("select", { class: "field", "aria-label": "Colour by" }, ...fields.map(({ field, label }) => h("option", { value: field }, label)));
     this.field.addEventListener("change", () => this.onField(this.field.value as Field));
     const more = h("button", { type: "button", class: "more", title: "Share, theme, keys, log out", "aria-expanded": "false" }, "⋯");
     const button = (label: string, title: string, run: () => void) => h("button", { type: "button", title, onclick: run }, label);
     this.element = h(
       "header", { class: "bar" },
-      h("h1", { class: "brand" }, "cairn"), choice, this.fields, this.field, h("span", { class: "space" }), this.link, more,
+      h("h1", { class: "brand" }, "cairn"), choice, layer, this.fields, this.field, h("span", { class: "space" }), this.link, more,
       h(
         "span", { class: "rare" },
         button("Share", "A link that shows another person the same", on.share),
