@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from cairn_map.queries.map_snapshot import MapSnapshot
     from cairn_map.queries.mark_groups import MarkGroup, group_marks
     from cairn_map.queries.occupancy_states import State
+    from cairn_map.wire.layer_messages import MappedLayer
 
     __version__: str
 
@@ -70,6 +71,7 @@ __all__ = [
     "LinkBack",
     "LinkLost",
     "MapSnapshot",
+    "MappedLayer",
     "MarkGroup",
     "NotFoundError",
     "OutboxNearlyFull",
@@ -120,6 +122,7 @@ _MODULES = {
     "cairn_map.queries.map_snapshot": "MapSnapshot",
     "cairn_map.queries.mark_groups": "MarkGroup group_marks",
     "cairn_map.queries.occupancy_states": "State",
+    "cairn_map.wire.layer_messages": "MappedLayer",
 }
 """Names by the module that defines them; the same as the imports above, which only type checkers read."""
 
