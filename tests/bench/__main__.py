@@ -30,6 +30,7 @@ from tests.bench.hot_spots import hot_spot_rows
 from tests.bench.imports import import_rows
 from tests.bench.integration import integration_rows
 from tests.bench.large_map import large_map_rows
+from tests.bench.layers import layer_rows
 from tests.bench.links import link_rows
 from tests.bench.live_mapping import live_mapping_rows
 from tests.bench.many_maps import many_map_rows
@@ -292,6 +293,7 @@ PARTS: dict[str, Callable[[bool], Iterator[Row]]] = {
     "imports": import_rows,
     "integration": integration_rows,
     "links": link_rows,
+    "layers": layer_rows,
     "marks": mark_rows,
     "overlay": overlay_rows,
     "peers": peer_rows,

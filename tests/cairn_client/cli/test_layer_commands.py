@@ -6,13 +6,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.fixtures.client.live_server import LiveServer
+from tests.fixtures.client.live_server import LiveServer, wait_until
 from tests.fixtures.client.made import GEOMETRY, MAP, seen
 from tests.fixtures.client.robot_program import RIG, scan_of
 from tests.fixtures.commands import cairn
 
 from cairn_client.folders.map_folder import layers_of, open_layers, open_map
+from cairn_client.folders.state_folder import opened_replica
 from cairn_client.http.api import MapApi
+from cairn_client.robot.layered_robot import lend_keys
 from cairn_client.robot.robot import Robot
 from cairn_fusion.recording.recording_writer import RecordingWriter
 from cairn_fusion.recording.scan import Scan
@@ -201,6 +203,33 @@ def test_robots_map_into_the_layer_that_an_option_or_an_operator_names(server: L
         assert f"[{kind}]" in cairn(*assign, *options, folder=tmp_path, code=3 if kind == "no_map" else 1)
     cairn(*assign, "--none", folder=tmp_path)
     assert "(none" in cairn("map", "layer", "assigned", server.map_url, folder=tmp_path)
+
+
+def test_what_a_robot_mapped_is_taken_out_of_all_layers_by_one_command(server: LiveServer, tmp_path: Path) -> None:
+    cairn("map", "layer", "add", server.map_url, "fine", "--voxel", "0.01", folder=tmp_path)
+    cairn("map", "layer", "add", server.map_url, "wide", "--voxel", "0.2", folder=tmp_path)
+    urls = {"evidence": server.map_url, "fine": f"{server.map_url}.fine"}
+    for name in ("mole", "wren"):
+        for layer, url in urls.items():
+            if layer == "fine":  # one name, one key: the folder for the second layer has the first one's
+                with opened_replica(tmp_path / f"{name}-evidence") as first:
+                    lend_keys(first, tmp_path / f"{name}-fine")
+            with Robot(None, url, directory=tmp_path / f"{name}-{layer}", name=name) as robot:
+                robot.replica.commit({cell_key((0, 0, 0)): seen(1 if name == "mole" else 2)})
+                robot.sync(until_folded=True)
+    retract = ("map", "retract", server.map_url)
+    asked = cairn(*retract, "--robot", "mole", "--all-layers", "--dry-run", folder=tmp_path)
+    assert [line for line in asked.splitlines() if not line.startswith("  ")] == [
+        f"would take out 1 commits of {name} (nothing was done):" for name in (MAP, f"{MAP}.fine")
+    ]
+    assert "bad_option" in cairn(
+        *retract, "--commit", "mole.0011223344556677.0", "--all-layers", folder=tmp_path, code=1
+    )
+    said = cairn(*retract, "--robot", "mole", "--all-layers", folder=tmp_path)
+    assert said.count("takes out 1 commits of") == 2
+    again = cairn(*retract, "--robot", "mole", "--all-layers", folder=tmp_path, code=3)
+    assert "nothing_to_retract" in again
+    wait_until(lambda: all(len(open_map(url).voxels_in()) == 1 for url in urls.values()))
 
 
 def test_a_server_of_before_has_maps_of_one_layer() -> None:
