@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from cairn_map.queries.mark_groups import MarkGroup, group_marks
     from cairn_map.queries.native.point_handle import PointHandle
     from cairn_map.queries.occupancy_states import State
+    from cairn_map.wire.layer_messages import MappedLayer
 
     __version__: str
 
@@ -73,6 +74,7 @@ __all__ = [
     "LinkBack",
     "LinkLost",
     "MapSnapshot",
+    "MappedLayer",
     "MarkGroup",
     "NotFoundError",
     "OutboxNearlyFull",
@@ -126,6 +128,7 @@ _MODULES = {
     "cairn_map.queries.mark_groups": "MarkGroup group_marks",
     "cairn_map.queries.native.point_handle": "PointHandle",
     "cairn_map.queries.occupancy_states": "State",
+    "cairn_map.wire.layer_messages": "MappedLayer",
 }
 """Names by the module that defines them; the same as the imports above, which only type checkers read."""
 

@@ -31,6 +31,7 @@ from tests.bench.hot_spots import hot_spot_rows
 from tests.bench.imports import import_rows
 from tests.bench.integration import integration_rows
 from tests.bench.large_map import large_map_rows
+from tests.bench.layers import layer_rows
 from tests.bench.level import level_rows
 from tests.bench.links import link_rows
 from tests.bench.live_mapping import live_mapping_rows
@@ -296,6 +297,7 @@ PARTS: dict[str, Callable[[bool], Iterator[Row]]] = {
     "integration": integration_rows,
     "level": level_rows,
     "links": link_rows,
+    "layers": layer_rows,
     "marks": mark_rows,
     "overlay": overlay_rows,
     "peers": peer_rows,

@@ -139,7 +139,7 @@ class MemoryShares:
 
 
 class MemoryNotes:
-    """`store.BranchNotes`."""
+    """`branch_signs.BranchNotes`."""
 
     def __init__(self, maps: MemoryMaps) -> None:
         self._maps = maps
@@ -174,6 +174,18 @@ class MemoryNotes:
                 author = commit.id.author if entry.kind == ENTRY_FOLD else None
                 found.append(EntrySize(seq, author, commit.size_bytes))
         return found
+
+    def assign(self, row: MapRow, robot: str, assignment: str | None) -> None:
+        """Keep which layers of a map a robot takes part in, or (None) no more."""
+        with self._maps.changing(row) as changed:
+            changed.assignments.pop(robot, None)
+            if assignment is not None:
+                changed.assignments[robot] = assignment
+
+    def assignments(self, row: MapRow) -> dict[str, str]:
+        """Assignments of a map, by robot."""
+        with self._maps.reading(row) as state:
+            return dict(sorted(state.assignments.items()))
 
 
 def _size_bytes(state: MemoryMap) -> int:

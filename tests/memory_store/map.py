@@ -107,6 +107,7 @@ class MemoryMap:
     cells: dict[CellKey, CellRow] = field(default_factory=dict)
     branches: dict[str, Branch] = field(default_factory=dict)
     statuses: dict[str, str] = field(default_factory=dict)
+    assignments: dict[str, str] = field(default_factory=dict)
     heard_s: dict[str, float] = field(default_factory=dict)
     """Times at which statuses were heard, where several servers note them."""
     views: dict[str, RobotView] = field(default_factory=dict)

@@ -1,9 +1,10 @@
-"""Layers in a simulation: operators of any server define them, and on each they must be those of its commits."""
+"""Layers in a simulation: operators of any server define them, and what happens may happen in one of them."""
 
 from random import Random
 
-from tests.fixtures.client.made import GEOMETRY
+from tests.fixtures.client.made import GEOMETRY, MAP
 from tests.fixtures.map.classed import CLASSED
+from tests.sync_sim.marks import has_marks
 from tests.sync_sim.server import SimServer
 
 from cairn_map.epochs.layer import LayerDefinition, MapLayer
@@ -31,6 +32,11 @@ Layers = dict[str, MapLayer]
 def has_layers(seed: int) -> bool:
     """True for every fifth seed: its operators add layers, with epochs and without, with marks and without."""
     return seed % 5 == 2
+
+
+def log_of(seed: int) -> str:
+    """Name of the log that a seed is about: a layer's of every fifth seed, unless it has marks, which are the map's."""
+    return f"{MAP}.fine" if seed % 5 == 3 and not has_marks(seed) else MAP
 
 
 def add_layer(server: SimServer, random: Random) -> None:

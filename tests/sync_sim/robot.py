@@ -7,10 +7,10 @@ one does not push.
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import apsw
-from tests.fixtures.client.made import PLAIN, B, random_diff, replica_on
+from tests.fixtures.client.made import B, random_diff, replica_on
 
 from cairn_client.replica.outbox import CommitFacts
 from cairn_client.replica.replica_store import ReplicaStore
@@ -35,6 +35,13 @@ HELPINGS: dict[str, dict[str, Any]] = {
 """Robots that fetch little at a time."""
 
 
+class MapOfRobots(Protocol):
+    """The map, or a layer of one, that robots are on."""
+
+    layer: MapLayer
+    name: str
+
+
 class MemoryDisk(ReplicaStore):
     """A replica's file in memory."""
 
@@ -56,10 +63,10 @@ class SimRobot:
     """One robot; `ask` sends a round's request on its way, and `answered` or `failed` is called some time later."""
 
     def __init__(
-        self, name: str, mode: str, ask: Callable[["SimRobot", int, Ask[Any]], None], *, layer: MapLayer = PLAIN
+        self, name: str, mode: str, ask: Callable[["SimRobot", int, Ask[Any]], None], *, of: "MapOfRobots"
     ) -> None:
         self.name = name
-        self._layer = layer
+        self._layer, self._map_name = of.layer, of.name
         self.mode = mode
         self._ask = ask
         self._rounds_begun = 0
@@ -95,7 +102,7 @@ class SimRobot:
 
     def check_view(self) -> None:
         """What the view shows is what a robot that starts now on a copy of this disk would show."""
-        copy = replica_on(MemoryDisk(self.disk.image()), self.name, layer=self._layer)
+        copy = replica_on(MemoryDisk(self.disk.image()), self.name, map_name=self._map_name, layer=self._layer)
         try:
             assert copy.view == self.replica.view, f"{self.name} shows another map than its disk holds"
         finally:
@@ -174,4 +181,4 @@ class SimRobot:
 
     def _open(self, disk: MemoryDisk) -> None:
         self.disk = disk
-        self.replica = replica_on(disk, self.name, layer=self._layer)
+        self.replica = replica_on(disk, self.name, map_name=self._map_name, layer=self._layer)

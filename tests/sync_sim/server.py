@@ -20,6 +20,7 @@ from cairn_map.epochs.history_map import HistoryMap
 from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import BadInputError, ConflictError, NotFoundError
 from cairn_map.evidence.grid import CellKey, cell_key
+from cairn_map.wire.layer_messages import AddLayer
 from cairn_map.wire.messages import CellIndex, CreateMap, MissingRequest, Retract
 from cairn_map.wire.relay_peer import SignedCommit
 from cairn_server.access.auth import Caller, Role
@@ -64,8 +65,10 @@ class StableBackup:
 class SimServer:
     """A server that can be restored and replaced."""
 
-    def __init__(self, layer: MapLayer = PLAIN) -> None:
+    def __init__(self, layer: MapLayer = PLAIN, *, name: str = MAP) -> None:
+        """Of a map, or of a layer of one by its name MAP.LAYER."""
         self.layer = layer
+        self.name = name
         self.settings = Settings()
         self._stable = StableBackup()
         self._backup: dict[str, MemoryMap] = {}
@@ -81,6 +84,10 @@ class SimServer:
         self._backup, self._stable.vector = {}, EMPTY
         self._start(MemoryStore())
         self.service.maps.create(MAP, CreateMap(geometry=self.layer.geometry, epoch_s=self.layer.epoch_s))
+        _, is_layer, layer = self.name.partition(".")
+        if is_layer:
+            request = AddLayer(name=layer, geometry=self.layer.geometry, epoch_s=self.layer.epoch_s)
+            self.service.sync.layers.add(self._store.map(MAP), request, by=Caller(Role.ADMIN))
         self._note_state()
 
     def restart(self) -> None:
@@ -90,7 +97,7 @@ class SimServer:
     def back_up(self) -> None:
         """Make a backup, and throw older ones away: what it holds is stable."""
         self._backup = {row.name: self._store._maps.shared(row) for row in self._store.maps()}
-        state = self._backup[MAP]
+        state = self._backup[self.name]
         self._stable.vector = MemorySnapshot(state).vector_at(state.head.seq)
 
     def restore(self) -> None:
@@ -259,8 +266,8 @@ class SimServer:
 
     @property
     def row(self) -> MapRow:
-        """The map."""
-        return self._store.map(MAP)
+        """The map, or the layer."""
+        return self._store.map(self.name)
 
     def _start(self, store: MemoryStore) -> None:
         self._store = store

@@ -13,6 +13,9 @@
     $ cairn map layer add http://127.0.0.1:8750/maps/lab things --voxel 0.05 --classes wall,floor,chair
     layer things of map lab: voxels of 5 cm, cells of 3.2 m, channels classes, epochs of 120 s
     classes wall, floor, chair, other
+    $ cairn map layer assign http://127.0.0.1:8750/maps/lab mole --contributes evidence,fine --inside fine=0,0,0,4,3,2
+    mole maps into evidence, fine in a box
+    $ cairn map layer assigned http://127.0.0.1:8750/maps/lab
 
 A map begins with one layer, `evidence`, and has at most 16. Each is pushed to, fetched, queried, drawn and exported
 under its own URL, by every command that takes a map's: MAP.LAYER. Robots' names, tokens, marks and the sensor model are
@@ -20,6 +23,11 @@ those of the map. A layer of the kind level is the ground outdoors: each scan vo
 `cairn map query MAP.LAYER elevation` reads them, with slopes, steps and what is in the way. A definition is a commit:
 relays carry it, and it never changes; another definition under the same name is refused (`other_layer`), also on a
 server that is joined later. It takes an operator's token to add one.
+
+`assign` says which layers a robot maps into, everywhere or where its head is inside or outside of a box, and which
+others it fetches. A robot that leaves it to operators (`cairn.LayeredRobot` without `contributes`) follows it from its
+next round on, `cairn robot run --assigned` when it starts; --none leaves it to the robot's own program again. It is
+kept by this server alone.
 
 A layer with --classes counts what label images show (RECORDING.md; `labels` of a scan): names of at most 63 classes,
 by commas or one a line in a file, to which `other` is added. They are fixed with the layer: more are another layer.
@@ -48,7 +56,7 @@ from cairn_map.epochs.layer import EVIDENCE
 from cairn_map.errors import BadInputError, first_error
 from cairn_map.evidence.channels import Channel, classes_channel
 from cairn_map.evidence.grid import LEVEL_EDGE_M, LEVEL_STEP_M, Geometry, geometry_for, level_geometry
-from cairn_map.wire.layer_messages import AddLayer, LayerInfo
+from cairn_map.wire.layer_messages import AddLayer, Assignment, LayerInfo
 
 LEVEL = "level"
 """Kind of a layer whose voxels are flat, as `--kind` names it."""
@@ -65,6 +73,8 @@ def add_parser(commands: Subparsers) -> None:
     )
     _add_add(parts)
     _add_list(parts)
+    _add_assign(parts)
+    _add_assigned(parts)
 
 
 def _add_add(commands: Subparsers) -> None:
@@ -84,6 +94,89 @@ def _add_add(commands: Subparsers) -> None:
 def _add_list(commands: Subparsers) -> None:
     listing = add_map_parser(commands, "list", _list, text="list the layers of a map")
     listing.add_argument("--json", action="store_true", help="print JSON")
+
+
+def _add_assign(commands: Subparsers) -> None:
+    assign = add_map_parser(commands, "assign", _assign, text="assign layers to a robot; takes an operator's token")
+    assign.add_argument("robot", help="its name, registered or not")
+    assign.add_argument("--contributes", metavar="LAYER,...", help="layers that it maps into, and keeps")
+    assign.add_argument("--fetches", metavar="LAYER,...", default="", help="other layers that it keeps to read")
+    for side in ("inside", "outside"):
+        assign.add_argument(
+            f"--{side}",
+            action="append",
+            default=[],
+            metavar="LAYER=X0,Y0,Z0,X1,Y1,Z1",
+            help=f"map into this layer only where its head is {side} this box, metres; may be repeated",
+        )
+    assign.add_argument("--none", action="store_true", help="leave its layers to its own program again")
+
+
+def _add_assigned(commands: Subparsers) -> None:
+    assigned = add_map_parser(commands, "assigned", _assigned, text="list the layers that are assigned to robots")
+    assigned.add_argument("--json", action="store_true", help="print JSON")
+
+
+def _assign(args: argparse.Namespace) -> int:
+    if args.none == (args.contributes is not None):
+        raise BadInputError("bad_option", "say --contributes LAYER,... or, to take it back, --none")
+    assignment = None if args.none else _assignment(args)
+    api, name = api_of(args.map, args.token)
+    with api:
+        if assignment is None:
+            api.unassign(name, args.robot)
+            say(f"{args.robot} maps as its own program says")
+        else:
+            api.assign(name, args.robot, assignment)
+            say(_assignment_line(args.robot, assignment))
+    return 0
+
+
+def _assignment(args: argparse.Namespace) -> Assignment:
+    """The options as an assignment.
+
+    Raises:
+        BadInputError: kind `bad_layer`: it cannot be; `bad_option`: a box of a layer that the robot does not map into.
+    """
+    mapped: dict[str, dict[str, object]] = {name: {"layer": name} for name in args.contributes.split(",")}
+    for side in ("inside", "outside"):
+        for text in getattr(args, side):
+            layer, _, corners = text.partition("=")
+            numbers = corners.split(",")
+            if layer not in mapped or len(numbers) != 6:
+                raise BadInputError(
+                    "bad_option", f"--{side} takes LAYER=X0,Y0,Z0,X1,Y1,Z1 of a layer in --contributes, got {text!r}"
+                )
+            mapped[layer][f"{side}_m"] = [numbers[:3], numbers[3:]]
+    try:
+        return Assignment.model_validate(
+            {"contributes": list(mapped.values()), "fetches": [name for name in args.fetches.split(",") if name]}
+        )
+    except ValidationError as exc:
+        raise BadInputError("bad_layer", f"the layers cannot be assigned: {first_error(exc)}") from exc
+
+
+def _assigned(args: argparse.Namespace) -> int:
+    api, name = api_of(args.map, args.token)
+    with api:
+        found = api.assignments(name)
+    if args.json:
+        say(json.dumps([each.model_dump(mode="json", exclude_none=True) for each in found]))
+        return 0
+    for each in found:
+        say(_assignment_line(each.robot, each.assignment))
+    if not found:
+        say("(none: every robot maps as its own program says)")
+    return 0
+
+
+def _assignment_line(robot: str, assignment: Assignment) -> str:
+    mapped = [
+        layer.layer + " in a box" * (layer.inside_m is not None) + " outside of a box" * (layer.outside_m is not None)
+        for layer in assignment.contributes
+    ]
+    fetched = f"; fetches {', '.join(assignment.fetches)}" if assignment.fetches else ""
+    return f"{robot} maps into {', '.join(mapped)}{fetched}"
 
 
 def _add(args: argparse.Namespace) -> int:

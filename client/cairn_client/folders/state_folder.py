@@ -34,6 +34,26 @@ def robot_of(folder: Path) -> str | None:
         return ReplicaState(store).robot
 
 
+def layer_folders(folder: Path) -> list[Path]:
+    """A robot's folder, or those of the layers that a `LayeredRobot` of a folder maps into, by name.
+
+    Raises:
+        BadInputError: kind `no_state_folder`: it is neither.
+        ConflictError: a robot has one open.
+    """
+    if is_state_folder(folder):
+        return [folder]
+    found = []
+    for each in sorted(folder.iterdir() if folder.is_dir() else ()):
+        if is_state_folder(each):
+            with closing(ReplicaStore(each)) as store:
+                if ReplicaState(store).mode != "viewer":
+                    found.append(each)
+    if not found:
+        check_state_folder(folder)
+    return found
+
+
 @contextmanager
 def opened_replica(folder: Path) -> Iterator[Replica]:
     """The map in a folder that exists, under the name that it has.

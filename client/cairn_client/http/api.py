@@ -33,7 +33,7 @@ from cairn_map.commits.commit import Commit
 from cairn_map.commits.cursor import cursor_from_text
 from cairn_map.commits.ids import Author, CommitId
 from cairn_map.commits.version_vector import EMPTY, VersionVector, vector_digest, version_vector_from_json
-from cairn_map.errors import BadInputError, CairnError, DamagedDataError, first_error
+from cairn_map.errors import BadInputError, CairnError, DamagedDataError, NotFoundError, first_error
 from cairn_map.evidence.fingerprint import fingerprint_from_hex
 from cairn_map.evidence.grid import Cell
 from cairn_map.machine_clocks import MACHINE_CLOCKS
@@ -52,7 +52,7 @@ from cairn_map.wire.change_messages import ChangesAnswer
 from cairn_map.wire.frames import FRAME_BYTES_MAX, JSON_BYTES_MAX, Frame
 from cairn_map.wire.hot_spot_messages import HotSpotsAnswer
 from cairn_map.wire.hottest_messages import HottestAnswer
-from cairn_map.wire.layer_messages import KINDS_FORMAT, AddLayer, LayerAdded, LayerInfo
+from cairn_map.wire.layer_messages import KINDS_FORMAT, AddLayer, Assignment, LayerAdded, LayerInfo, RobotAssignment
 from cairn_map.wire.mark_messages import AttachmentState, MarkPage, MarkReceipt, MarkRequest, WantedAttachments
 from cairn_map.wire.messages import (
     INDEX_PAGE,
@@ -373,6 +373,28 @@ class MapApi:
         """Add a layer to a map, as an operator; an equal one stays as it is."""
         body = self._ask("POST", f"/maps/{name}/layers", content=request.model_dump_json().encode())
         return message_from_json(LayerAdded, body)
+
+    def assignment(self, name: str, robot: str) -> Assignment | None:
+        """Layers that operators assigned to a robot; None: none, or the server is of an earlier version."""
+        try:
+            found = list_of(RobotAssignment, self._ask("GET", f"/maps/{name}/assignments", params={"robot": robot}))
+        except NotFoundError as exc:
+            if exc.kind != "no_route":
+                raise
+            return None
+        return next((each.assignment for each in found if each.robot == robot), None)
+
+    def assignments(self, name: str) -> list[RobotAssignment]:
+        """Layers that operators assigned to robots, by robot."""
+        return list_of(RobotAssignment, self._ask("GET", f"/maps/{name}/assignments"))
+
+    def assign(self, name: str, robot: str, assignment: Assignment) -> None:
+        """Assign layers to a robot, as an operator."""
+        self._ask("PUT", f"/maps/{name}/assignments/{robot}", content=assignment.model_dump_json().encode())
+
+    def unassign(self, name: str, robot: str) -> None:
+        """Leave a robot's layers to its program again, as an operator."""
+        self._ask("DELETE", f"/maps/{name}/assignments/{robot}")
 
     def wanted_attachments(self, name: str, *, robot: str | None = None) -> WantedAttachments:
         """Attachments of marks that the server lacks: all, or those that a robot may have."""

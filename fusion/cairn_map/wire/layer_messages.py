@@ -1,13 +1,13 @@
 """JSON messages about the layers of a map: a list of them, and what an operator adds."""
 
-from typing import Annotated
+from typing import Annotated, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
-from cairn_map.epochs.layer import EVIDENCE, EpochLength, LayerDefinition, LayerName
+from cairn_map.epochs.layer import EVIDENCE, LAYERS_MAX, EpochLength, LayerDefinition, LayerName
 from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.grid import Geometry
-from cairn_map.wire.messages import IdText, MapInfo, MapNameText
+from cairn_map.wire.messages import IdText, MapInfo, MapNameText, NameText
 
 LAYER_FORMAT = 4
 """`Cairn-Format` from which on a client knows of layers: to others a server names none in its list of maps."""
@@ -58,6 +58,63 @@ class LayerAdded(_Model):
     commit: IdText | None
     """Commit that defines the layer; None: an equal one was there."""
     layer: LayerInfo
+
+
+Corner = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+BoxM = tuple[Corner, Corner]
+"""Lowest and highest corner, metres, map frame."""
+
+
+class MappedLayer(_Model):
+    """One layer that a robot maps into: everywhere, or where its head is in a box, or is not in one."""
+
+    layer: LayerName
+    inside_m: BoxM | None = None
+    outside_m: BoxM | None = None
+
+    @model_validator(mode="after")
+    def _boxes_are_some(self) -> Self:
+        for box in (self.inside_m, self.outside_m):
+            if box is not None and not all(low < high for low, high in zip(*box, strict=True)):
+                raise ValueError("a box is its lowest and its highest corner, metres")
+        return self
+
+    def takes(self, place_m: Corner) -> bool:
+        """True if a scan from a place, metres, map frame, goes into the layer."""
+        return (self.inside_m is None or _is_in(place_m, self.inside_m)) and (
+            self.outside_m is None or not _is_in(place_m, self.outside_m)
+        )
+
+
+class Assignment(_Model):
+    """Layers of a map that a robot takes part in."""
+
+    contributes: Annotated[tuple[MappedLayer, ...], Field(min_length=1, max_length=LAYERS_MAX)]
+    """Those that it maps into, and keeps."""
+    fetches: Annotated[tuple[LayerName, ...], Field(max_length=LAYERS_MAX)] = ()
+    """Others that it keeps to read."""
+
+    @model_validator(mode="after")
+    def _layers_differ(self) -> Self:
+        if len({*self.layers}) != len(self.layers):
+            raise ValueError(f"a layer is named once, got {', '.join(self.layers)}")
+        return self
+
+    @property
+    def layers(self) -> tuple[str, ...]:
+        """Names of all layers, first those that it maps into."""
+        return (*(each.layer for each in self.contributes), *self.fetches)
+
+
+class RobotAssignment(_Model):
+    """Assignment of a robot on a map."""
+
+    robot: NameText
+    assignment: Assignment
+
+
+def _is_in(place_m: Corner, box: BoxM) -> bool:
+    return all(low <= at < high for low, at, high in zip(box[0], place_m, box[1], strict=True))
 
 
 def is_listed(geometry: Geometry, known: int) -> bool:

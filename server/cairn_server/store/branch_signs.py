@@ -1,8 +1,11 @@
-"""Last sign of each branch, gathered so that a crowd's signs are one write."""
+"""Notes on branches: their protocol, and the last sign of each, gathered so that a crowd's signs are one write."""
 
 import threading
 import time
 from dataclasses import dataclass
+from typing import Protocol
+
+from cairn_server.store.store_rows import EntrySize, HeardRobot, MapRow
 
 KEEP_S = 10.0
 """Time between two writes of a branch that only gives signs of life."""
@@ -56,3 +59,37 @@ class LastSeen:
         """Forget a branch whose row is replaced or removed; its signs are `taken` before."""
         with self._lock:
             self._written.pop((map_number, name), None)
+
+
+class BranchNotes(Protocol):
+    """Notes on branches (`Store.notes`); every method may be called from any thread."""
+
+    def put_status(self, row: MapRow, branch: str, status: str) -> None:
+        """Keep the last status of a branch, as JSON, if there is such a branch; may be written later.
+
+        It goes with the branch.
+        """
+        ...
+
+    def statuses(self, row: MapRow) -> dict[str, str]:
+        """Last status of each branch that ever reported one."""
+        ...
+
+    def heard(self, *, limit: int) -> list[HeardRobot]:
+        """Robots of all maps by their last signs, the newest first; a sign may be missing for some seconds."""
+        ...
+
+    def entry_sizes(self, row: MapRow, *, after_seq: int, limit: int) -> list[EntrySize]:
+        """Sizes of log entries after one, oldest first, at most `limit`."""
+        ...
+
+    def assign(self, row: MapRow, robot: str, assignment: str | None) -> None:
+        """Keep which layers of a map a robot takes part in, as JSON, or (None) no more; durable on return.
+
+        The robot need not be registered; it goes with the map alone.
+        """
+        ...
+
+    def assignments(self, row: MapRow) -> dict[str, str]:
+        """Assignments of a map, by robot."""
+        ...

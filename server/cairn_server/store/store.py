@@ -23,6 +23,7 @@ from cairn_map.wire.messages import LogEntry
 from cairn_server.map_refusals import GoneMap
 from cairn_server.store.admission import OWN_WORD, Grounds, RobotKey
 from cairn_server.store.attachments.attachments import Attachments
+from cairn_server.store.branch_signs import BranchNotes
 from cairn_server.store.replica_notes import ReplicaNotes
 from cairn_server.store.store_age import StoreAge
 from cairn_server.store.store_clock import StoreClock
@@ -35,9 +36,7 @@ from cairn_server.store.store_rows import (
     ChainedEntry,
     ClosedRobot,
     Contribution,
-    EntrySize,
     Fold,
-    HeardRobot,
     MapRow,
     MarkBox,
     MarkChange,
@@ -182,29 +181,6 @@ class FoldLeases(Protocol):
 
 LEASE_S = 5.0
 """Seconds for which a claim of a map lasts: a process that was killed holds its maps up so long."""
-
-
-class BranchNotes(Protocol):
-    """Notes on branches (`Store.notes`); every method may be called from any thread."""
-
-    def put_status(self, row: MapRow, branch: str, status: str) -> None:
-        """Keep the last status of a branch, as JSON, if there is such a branch; may be written later.
-
-        It goes with the branch.
-        """
-        ...
-
-    def statuses(self, row: MapRow) -> dict[str, str]:
-        """Last status of each branch that ever reported one."""
-        ...
-
-    def heard(self, *, limit: int) -> list[HeardRobot]:
-        """Robots of all maps by their last signs, the newest first; a sign may be missing for some seconds."""
-        ...
-
-    def entry_sizes(self, row: MapRow, *, after_seq: int, limit: int) -> list[EntrySize]:
-        """Sizes of log entries after one, oldest first, at most `limit`."""
-        ...
 
 
 class Uses(Protocol):

@@ -1,14 +1,15 @@
-"""Layers of maps: a list of them for any reader, and what operators add.
+"""Layers of maps: a list of them for any reader, what operators add, and the robots that they assign to them.
 
 A further layer is defined by a commit of the author `operator` in its map's log, which relays carry and robots keep as
 they do retracts and marks. With that commit the store has the layer, as a log of its own under the name MAP.LAYER.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
+from cairn_map.commits.ids import map_of_layer, robot_name
 from cairn_map.epochs.layer import EVIDENCE
-from cairn_map.errors import BadInputError
-from cairn_map.wire.layer_messages import AddLayer, LayerAdded, LayerInfo, layer_info
+from cairn_map.errors import BadInputError, NotFoundError
+from cairn_map.wire.layer_messages import AddLayer, Assignment, LayerAdded, LayerInfo, RobotAssignment, layer_info
 from cairn_map.wire.messages import MapInfo
 from cairn_server.access.auth import Caller
 from cairn_server.cell_room import check_geometry
@@ -72,3 +73,44 @@ class MapLayers:
         )
         self._on_new()
         return LayerAdded(commit=str(commit), layer=layer_info(self._info(self._store.map(name))))
+
+    def assignments(self, row: MapRow, robot: str | None = None) -> Sequence[RobotAssignment]:
+        """Assignments of a map, or of the map of a layer: of all robots by name, or (one at most) of a robot."""
+        found = self._store.notes.assignments(self._whole(row))
+        return [
+            RobotAssignment(robot=name, assignment=Assignment.model_validate_json(text))
+            for name, text in found.items()
+            if robot in (None, name)
+        ]
+
+    def assign(self, row: MapRow, robot: str, assignment: Assignment, *, by: Caller) -> None:
+        """Say which layers of a map a robot takes part in, whether it is registered or not; durable on return.
+
+        The robot asks for it with its next round. It is of this server: relays carry none.
+
+        Raises:
+            BadInputError: kind `layer_of_map`: the map is a layer itself; `bad_name`.
+            NotFoundError: kind `no_map`: the map has no such layer.
+        """
+        if row.of_map is not None:
+            raise layer_of_map(row.name, "assign its layers on the map")
+        for layer in assignment.layers:
+            self._store.map(row.name if layer == EVIDENCE else f"{row.name}.{layer}")
+        self._store.notes.assign(row, robot_name(robot), assignment.model_dump_json(exclude_none=True))
+        detail = f"map {row.name}: {robot} maps into {', '.join(each.layer for each in assignment.contributes)}"
+        self._store.audit_log.add(by.name, "assign_layers", detail, client=by.address)
+
+    def unassign(self, row: MapRow, robot: str, *, by: Caller) -> None:
+        """Leave a robot's layers to its program again.
+
+        Raises:
+            NotFoundError: kind `no_assignment`: it has none.
+        """
+        if robot not in self._store.notes.assignments(self._whole(row)):
+            raise NotFoundError("no_assignment", f"robot {robot[:32]!r} has no layers assigned on map {row.name}")
+        self._store.notes.assign(self._whole(row), robot, None)
+        self._store.audit_log.add(by.name, "unassign_layers", f"map {row.name}: {robot}", client=by.address)
+
+    def _whole(self, row: MapRow) -> MapRow:
+        name = map_of_layer(row.name)
+        return row if name is None else self._store.map(name)

@@ -16,6 +16,7 @@ from cairn_calib.rig.camera import Camera
 from cairn_calib.rig.poses import Transform, check_transform, look_at
 from cairn_calib.rig.rig import Rig, Spectrum, mount_camera
 from cairn_client import main as cairn
+from cairn_client.folders.state_folder import opened_replica
 from cairn_client.robot.kept_scans import KeptScans
 from cairn_client.robot.robot import Robot
 from cairn_fusion.mapping.integrate import integrate_scan
@@ -277,3 +278,24 @@ def test_a_head_that_is_not_kept_is_asked_for_and_one_that_is_named_counts(
 def test_poses_are_taken_as_a_scan_takes_them() -> None:
     T = corrected(3, 1000).T_map_rig
     assert np.array_equal(check_transform(T), replace(scan_of(3), T_map_rig=T).T_map_rig)
+
+
+def test_the_measurements_of_a_robot_on_several_layers_are_amended_in_each(run: Run, tmp_path: Path) -> None:
+    state = tmp_path / "state"
+    state.mkdir()
+    for layer in ("evidence", "fine"):
+        with keeper(tmp_path / layer) as robot:
+            measured(robot, 1, 2)
+        (tmp_path / layer / "mole").rename(state / layer)
+    with Robot(None, NOWHERE, directory=state / "wide", name="mole", mode="viewer", geometry=GEOMETRY):
+        pass
+
+    def seen_in(layer: str) -> object:
+        with opened_replica(state / layer) as replica:
+            return cells_of(replica.view)
+
+    before = seen_in("fine")
+    said = run("amend", state, "--trajectory", trajectory(tmp_path / "slam.tum", (1, 2)))
+    assert said.count("1 measurement of mole amended") == 2
+    assert seen_in("evidence") == seen_in("fine") != before
+    assert "no_state_folder" in run("amend", tmp_path / "none", "--trajectory", tmp_path / "slam.tum", code=1)

@@ -6,14 +6,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.fixtures.client.live_server import LiveServer
+from tests.fixtures.client.live_server import LiveServer, wait_until
 from tests.fixtures.client.made import GEOMETRY, MAP, seen
-from tests.fixtures.client.robot_program import RIG
+from tests.fixtures.client.robot_program import RIG, scan_of
 from tests.fixtures.commands import cairn
 
 from cairn_client.folders.map_folder import layers_of, open_layers, open_map
+from cairn_client.folders.state_folder import opened_replica
 from cairn_client.http.api import MapApi
+from cairn_client.robot.layered_robot import lend_keys
 from cairn_client.robot.robot import Robot
+from cairn_fusion.recording.recording_writer import RecordingWriter
 from cairn_fusion.recording.scan import Scan
 from cairn_map.errors import NotFoundError
 from cairn_map.evidence.grid import cell_key
@@ -151,6 +154,82 @@ def test_rays_slices_and_files_are_of_the_finest_layer_that_knows_each_place(
     cairn("map", "export", server.map_url, "--ply", str(one), "--layer", "fine", folder=tmp_path)
     head = one.read_bytes().partition(b"end_header")[0].decode()
     assert (f"element vertex {len(layers['fine'].occupied_in())}\n" in head, "edge" in head) == (True, False)
+
+
+def test_robots_map_into_the_layer_that_an_option_or_an_operator_names(server: LiveServer, tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "room", RIG, name="room") as writer:
+        for seed in (1, 2):
+            writer.add(scan_of(seed))
+    for name in ("wide", "wider"):
+        cairn("map", "layer", "add", server.map_url, name, "--voxel", "0.2", folder=tmp_path)
+
+    def replayed(*options: str, code: int = 0) -> str:
+        words = ("robot", "replay", "room", "--map", server.map_url, "--name", "mole", *options)
+        return cairn(*words, folder=tmp_path, code=code)
+
+    def cells() -> dict[str, int]:
+        with MapApi(server.url) as api:
+            return {layer.name: layer.cells for layer in api.layers(MAP)}
+
+    # A layer that is there, in a folder of its own; one name, one key: the folders lend it to one another.
+    said = replayed("--layer", "far", code=3)
+    assert "no layer 'far' of map" in said
+    assert "cairn map layer add" in said
+    assert "cairn map layer add" in replayed("--layer", "far", "--voxel", "0.1", code=3)
+    assert [path.name for path in tmp_path.glob("cairn-*")] == []
+    replayed("--layer", "wide")
+    assert {name for name, count in cells().items() if count} == {"wide"}
+    replayed()
+    assert {name for name, count in cells().items() if count} == {"evidence", "wide"}
+    assert sorted(path.name for path in tmp_path.glob("cairn-*")) == ["cairn-mole", "cairn-mole.wide"]
+
+    # As operators say.
+    assign = ("map", "layer", "assign", server.map_url, "mole")
+    assert "no layers" in replayed("--assigned", code=3)
+    said = cairn(*assign, "--contributes", "evidence,wider", "--inside", "wider=0,0,0,1,1,1", folder=tmp_path)
+    assert said == "mole maps into evidence, wider in a box\n"
+    assert "--layer" in replayed("--assigned", code=1)
+    cairn(*assign, "--contributes", "wider", "--fetches", "wide", folder=tmp_path)
+    listed = cairn("map", "layer", "assigned", server.map_url, folder=tmp_path)
+    assert listed == "mole maps into wider; fetches wide\n"
+    replayed("--assigned")
+    assert all(cells().values())
+    for options, kind in (
+        (("--contributes", "far"), "no_map"),
+        (("--contributes", "wide", "--fetches", "wide"), "bad_layer"),
+        (("--contributes", "wide", "--inside", "wider=0,0,0,1,1,1"), "bad_option"),
+        ((), "bad_option"),
+    ):
+        assert f"[{kind}]" in cairn(*assign, *options, folder=tmp_path, code=3 if kind == "no_map" else 1)
+    cairn(*assign, "--none", folder=tmp_path)
+    assert "(none" in cairn("map", "layer", "assigned", server.map_url, folder=tmp_path)
+
+
+def test_what_a_robot_mapped_is_taken_out_of_all_layers_by_one_command(server: LiveServer, tmp_path: Path) -> None:
+    cairn("map", "layer", "add", server.map_url, "fine", "--voxel", "0.01", folder=tmp_path)
+    cairn("map", "layer", "add", server.map_url, "wide", "--voxel", "0.2", folder=tmp_path)
+    urls = {"evidence": server.map_url, "fine": f"{server.map_url}.fine"}
+    for name in ("mole", "wren"):
+        for layer, url in urls.items():
+            if layer == "fine":  # one name, one key: the folder for the second layer has the first one's
+                with opened_replica(tmp_path / f"{name}-evidence") as first:
+                    lend_keys(first, tmp_path / f"{name}-fine")
+            with Robot(None, url, directory=tmp_path / f"{name}-{layer}", name=name) as robot:
+                robot.replica.commit({cell_key((0, 0, 0)): seen(1 if name == "mole" else 2)})
+                robot.sync(until_folded=True)
+    retract = ("map", "retract", server.map_url)
+    asked = cairn(*retract, "--robot", "mole", "--all-layers", "--dry-run", folder=tmp_path)
+    assert [line for line in asked.splitlines() if not line.startswith("  ")] == [
+        f"would take out 1 commits of {name} (nothing was done):" for name in (MAP, f"{MAP}.fine")
+    ]
+    assert "bad_option" in cairn(
+        *retract, "--commit", "mole.0011223344556677.0", "--all-layers", folder=tmp_path, code=1
+    )
+    said = cairn(*retract, "--robot", "mole", "--all-layers", folder=tmp_path)
+    assert said.count("takes out 1 commits of") == 2
+    again = cairn(*retract, "--robot", "mole", "--all-layers", folder=tmp_path, code=3)
+    assert "nothing_to_retract" in again
+    wait_until(lambda: all(len(open_map(url).voxels_in()) == 1 for url in urls.values()))
 
 
 def test_a_server_of_before_has_maps_of_one_layer() -> None:

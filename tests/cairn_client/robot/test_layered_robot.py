@@ -1,6 +1,7 @@
 """A robot on several layers: each gets its scans at its resolution, one key vouches for all, the finest answers."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,16 +9,16 @@ import pytest
 from tests.fixtures.client.made import GEOMETRY, MAP
 from tests.fixtures.client.robot_program import INTEGRATOR, RIG, scan_of
 from tests.fixtures.server.access import ADMIN, ENROLLER
-from tests.fixtures.server.live import Live
+from tests.fixtures.server.live import Live, until
 
 from cairn_client.robot.layered_robot import LayeredRobot
 from cairn_client.robot.robot import Robot
 from cairn_fusion.mapping.integrate import integrate_scan
 from cairn_map.epochs.history_map import HistoryMap
 from cairn_map.epochs.layer import EVIDENCE, MapLayer
-from cairn_map.errors import BadInputError, DeniedError
+from cairn_map.errors import BadInputError, DeniedError, NotFoundError
 from cairn_map.evidence.grid import Geometry
-from cairn_map.wire.layer_messages import AddLayer
+from cairn_map.wire.layer_messages import AddLayer, Assignment, MappedLayer
 from cairn_map.wire.messages import CreateMap
 from cairn_server.access.auth import ADMIN_FILE
 
@@ -112,6 +113,106 @@ def test_a_name_is_one_robot_s_on_all_layers(live: Live, tmp_path: Path) -> None
             with pytest.raises(DeniedError) as refused:
                 thief.sync()
             assert refused.value.kind == "not_admitted"
+
+
+def assign(live: Live, *contributes: str | MappedLayer, fetches: tuple[str, ...] = ()) -> None:
+    mapped = [each if isinstance(each, MappedLayer) else MappedLayer(layer=each) for each in contributes]
+    assignment = Assignment(contributes=tuple(mapped), fetches=fetches)
+    live.service.sync.layers.assign(live.service.store.map(MAP), "mole", assignment, by=ADMIN_FILE)
+
+
+def followed(live: Live, folder: Path) -> LayeredRobot:
+    """A robot that leaves its layers to operators."""
+    standard = dict.fromkeys(GRIDS, INTEGRATOR)
+    return LayeredRobot(
+        RIG, url_of(live), directory=folder / "mole", name="mole", token=ENROLLER, integrators=standard, stay=True
+    )
+
+
+def test_operators_assign_layers_and_the_robot_takes_them_with_its_next_round(live: Live, tmp_path: Path) -> None:
+    with pytest.raises(NotFoundError, match="cairn map layer assign") as unknown:
+        followed(live, tmp_path)
+    assert unknown.value.kind == "no_assignment"
+    assign(live, EVIDENCE, fetches=("wide",))
+    with followed(live, tmp_path) as mole:
+        assert (mole.contributes, {*mole.robots}) == ((EVIDENCE,), {EVIDENCE, "wide"})
+        mole.observe(scan_of(1))
+        assert mole.commit().keys() == {EVIDENCE}
+        # Evidence of a layer that it leaves is pushed first; what it fetched it may map into.
+        mole.observe(scan_of(2))
+        assign(live, "fine", "wide")
+        mole.sync()
+        assert (mole.contributes, {*mole.robots}) == (("fine", "wide"), {"fine", "wide"})
+        mole.observe(scan_of(3))
+        assert mole.commit().keys() == {"fine", "wide"}
+        mole.sync(until_folded=True)
+        live.service.sync.layers.unassign(live.service.store.map(MAP), "mole", by=ADMIN_FILE)
+        mole.sync()  # nothing new: it stays as it is
+        assert mole.contributes == ("fine", "wide")
+    # The next start has them from its folder; and what all pushed is on the server.
+    with followed(live, tmp_path) as mole:
+        assert mole.contributes == ("fine", "wide")
+    with opened(live, tmp_path, ["wide"], [EVIDENCE, "fine"], name="wren") as wren:
+        wren.sync()
+        expected = {EVIDENCE: made(EVIDENCE, 1, 2), "fine": made("fine", 3), "wide": made("wide", 3)}
+        assert {layer: each.map for layer, each in wren.robots.items()} == expected
+
+
+def test_a_robot_switches_layers_by_place(live: Live, tmp_path: Path) -> None:
+    x = float(scan_of(1).T_map_rig[0, 3])
+    house = ((-9.0, -9.0, -9.0), (x + 1e-6, 9.0, 9.0))
+    assign(live, MappedLayer(layer=EVIDENCE, inside_m=house), MappedLayer(layer="wide", outside_m=house), "fine")
+    farther = next(seed for seed in range(2, 50) if scan_of(seed).T_map_rig[0, 3] > x + 0.01)
+    with followed(live, tmp_path) as mole:
+        mole.observe(scan_of(1))
+        mole.observe(scan_of(farther))
+        assert mole.commit().keys() == {EVIDENCE, "wide", "fine"}
+        expected = {EVIDENCE: (1,), "wide": (farther,), "fine": (1, farther)}
+        for layer, seeds in expected.items():
+            assert mole.robots[layer].map == made(layer, *seeds)
+        with pytest.raises(BadInputError, match="maps into"):
+            mole.observe(scan_of(1), into=["far"])
+
+
+def test_layers_that_are_assigned_while_it_syncs_in_the_background_are_opened(live: Live, tmp_path: Path) -> None:
+    assign(live, EVIDENCE)
+    with followed(live, tmp_path) as mole:
+        mole.start_sync(every_s=0.05)
+        assign(live, "fine")
+        until(lambda: (mole.commit(), mole.contributes)[1] == ("fine",), "it maps into the other layer")
+        mole.observe(scan_of(1))
+        assert mole.commit().keys() == {"fine"}
+
+
+def test_a_measurement_is_amended_and_taken_back_in_all_its_layers(live: Live, tmp_path: Path) -> None:
+    moved = np.eye(4)
+    moved[0, 3] = 0.5
+    with LayeredRobot(
+        RIG,
+        url_of(live),
+        directory=tmp_path / "mole",
+        name="mole",
+        contributes=[EVIDENCE, "fine"],
+        token=ENROLLER,
+        integrators=dict.fromkeys(GRIDS, INTEGRATOR),
+        keep_scans_bytes=1 << 20,
+    ) as mole:
+        mole.observe(scan_of(1))
+        first = mole.commit()
+        mole.observe(scan_of(2))
+        second = mole.commit()
+        mole.sync(until_folded=True)
+        amended = mole.amend(first, T_map_observed=moved)
+        assert amended.keys() == {EVIDENCE, "fine"}
+        mole.retract(second, note="in the dark")
+        mole.sync(until_folded=True)
+        there = replace(scan_of(1), T_map_rig=moved @ scan_of(1).T_map_rig)
+        for layer, robot in mole.robots.items():
+            total = HistoryMap(MapLayer(geometry=GRIDS[layer]))
+            total.merge(integrate_scan(there, RIG, GRIDS[layer], integrator=INTEGRATOR))
+            assert robot.map == total
+        with pytest.raises(BadInputError, match="maps into"):
+            mole.amend({"wide": first["fine"]}, T_map_observed=moved)
 
 
 def test_what_no_layered_robot_can_be_is_refused(live: Live, tmp_path: Path) -> None:

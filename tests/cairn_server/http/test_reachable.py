@@ -107,10 +107,10 @@ def test_a_role_is_asked_before_a_body_is_read(guarded: Live) -> None:
     body = {"role": "reader", "map": row.name}
     reader = guarded.http.put(f"/tokens/{row.name}-eyes", json=body, headers=bearer(ADMIN)).json()["token"]
     places = {"name": row.name, "branch": "mole", "commit": str(pushed(0, 0).id), "cell": "0,0,0", "token": "new"}
-    places["sha"] = "0" * 64
+    places |= {"sha": "0" * 64, "robot": "mole"}
     document = guarded.http.get("/openapi.json").json()["paths"]
     routes = [(method, path) for path, at in document.items() for method, told in at.items() if "requestBody" in told]
-    assert len(routes) == 15
+    assert len(routes) == 16
     for method, path in routes:
         # Two of them are for readers: an enroller may not use them.
         token = ENROLLER if "tickets" in path or "/main/cells/" in path else reader

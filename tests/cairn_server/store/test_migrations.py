@@ -63,6 +63,7 @@ def test_an_older_store_opens_with_all_that_it_held_and_goes_on(name: str, tmp_p
 
 
 WITHOUT_EPOCHS = """
+DROP TABLE assignment;
 DROP TABLE attachment;
 DROP TABLE attachment_part;
 DROP TABLE mark;

@@ -100,7 +100,7 @@ def test_a_store_of_the_first_step_takes_those_that_it_lacks(
 
 WITHOUT_EPOCHS = """
 ALTER TABLE audit DROP COLUMN client;
-DROP TABLE attachment, attachment_part, mark, gone_map, gone_token;
+DROP TABLE assignment, attachment, attachment_part, mark, gone_map, gone_token;
 ALTER TABLE author DROP COLUMN kept_bytes;
 ALTER TABLE author DROP COLUMN marks;
 ALTER TABLE age DROP COLUMN clock;

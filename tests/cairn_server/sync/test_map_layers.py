@@ -2,9 +2,11 @@
 
 import shutil
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 from tests.fixtures.map.classed import CLASSED
 from tests.fixtures.map.layers import FINE, layer_commit
@@ -18,7 +20,7 @@ from tests.fixtures.server.stores import one_server
 
 from cairn_map.epochs.layer import LAYERS_MAX
 from cairn_map.evidence.grid import Geometry, level_geometry
-from cairn_map.wire.layer_messages import LayerAdded, LayerInfo
+from cairn_map.wire.layer_messages import Assignment, LayerAdded, LayerInfo
 from cairn_server.store.store_rows import MapRow
 
 KNOWS_LAYERS = {"Cairn-Format": "4"}
@@ -215,6 +217,49 @@ def test_operators_add_layers_readers_list_them_and_robots_only_map(guarded: Liv
     assert guarded.http.delete(f"/maps/{row.name}/branches/wren", headers=bearer(ADMIN)).status_code == 204
     assert guarded.http.get(f"/maps/{fine.name}", headers=bearer(of_layer)).status_code == 401
     assert guarded.http.get(f"/maps/{fine.name}/branches", headers=bearer(ADMIN)).json() == []
+
+
+def test_operators_assign_layers_to_robots_who_see_it_on_the_map_and_on_each_layer(guarded: Live) -> None:
+    row = guarded.new_map()
+    add(guarded, row, headers=bearer(ADMIN))
+    fine = layer_of(guarded, row)
+    body = {"role": "operator", "map": row.name}
+    operator = guarded.http.put(f"/tokens/boss-of-{row.name}", json=body, headers=bearer(ADMIN)).json()["token"]
+    robot = robot_token(guarded, fine, "mole")
+    path = f"/maps/{row.name}/assignments"
+    box = [[0.0, 0.0, -1.0], [4.0, 3.0, 2.0]]
+    assignment = {"contributes": [{"layer": "evidence"}, {"layer": "fine", "inside_m": box}], "fetches": []}
+
+    def refused(answer: httpx.Response) -> tuple[int, str]:
+        return answer.status_code, kind_of(answer)
+
+    assert guarded.http.get(path, headers=bearer(operator)).json() == []
+    assert refused(guarded.http.put(f"{path}/mole", json=assignment, headers=bearer(robot)))[0] in (401, 403)
+    # Of layers that are there, each once, on the map; of a robot that can be.
+    put = partial(guarded.http.put, headers=bearer(operator))
+    for wrong, expected in (
+        ({"contributes": [{"layer": "wide"}]}, (404, "no_map")),
+        ({"contributes": []}, (422, "bad_message")),
+        ({"contributes": [{"layer": "fine"}], "fetches": ["fine"]}, (422, "bad_message")),
+        ({"contributes": [{"layer": "fine", "inside_m": box[::-1]}]}, (422, "bad_message")),
+        ({"contributes": [{"layer": "fine"}], "more": 1}, (422, "bad_message")),
+    ):
+        assert refused(put(f"{path}/mole", json=wrong)) == expected
+    assert "cairn map layer" in put(f"{path}/mole", json={"contributes": [{"layer": "wide"}]}).text
+    assert refused(put(f"{path}/No", json=assignment)) == (400, "bad_name")
+    assert refused(put(f"/maps/{fine.name}/assignments/mole", json=assignment)) == (400, "layer_of_map")
+    assert put(f"{path}/mole", json=assignment).status_code == 204
+    assert put(f"{path}/wren", json={"contributes": [{"layer": "evidence"}]}).status_code == 204
+    # A robot with a token of one layer sees its own there; the map's list has all.
+    asked = guarded.http.get(f"/maps/{fine.name}/assignments", params={"robot": "mole"}, headers=bearer(robot)).json()
+    assert [each["robot"] for each in asked] == ["mole"]
+    assert Assignment.model_validate(asked[0]["assignment"]) == Assignment.model_validate(assignment)
+    listed = guarded.http.get(path, headers=bearer(ENROLLER)).json()
+    assert [each["robot"] for each in listed] == ["mole", "wren"]
+    # Taken back, once.
+    for expected in (204, 404):
+        assert guarded.http.delete(f"{path}/mole", headers=bearer(operator)).status_code == expected
+    assert [each["robot"] for each in guarded.http.get(path, headers=bearer(operator)).json()] == ["wren"]
 
 
 @one_server("its folder is copied")

@@ -17,6 +17,7 @@
     $ cairn map layer add http://127.0.0.1:8750/maps/lab fine --voxel 0.01
     $ cairn map branches http://127.0.0.1:8750/maps/lab
     $ cairn map retract http://127.0.0.1:8750/maps/lab --robot mole --pushed-after 14:05 --dry-run
+    $ cairn map retract http://127.0.0.1:8750/maps/lab --robot mole --all-layers
     $ cairn map robots list http://127.0.0.1:8750/maps/lab
     $ cairn map delete http://127.0.0.1:8750/maps/lab
     $ cairn map query lab/ ray 1,2,0.4 0,1,0
@@ -58,10 +59,11 @@ from cairn_client.cli.maps import (
     robots,
     server_copy,
 )
+from cairn_client.folders.map_folder import layers_of
 from cairn_client.http.api import MapApi
 from cairn_client.sync.responses import one_line
 from cairn_map.errors import BadInputError, NotFoundError
-from cairn_map.wire.messages import MapSizes, Retract
+from cairn_map.wire.messages import MapSizes, Retract, Retracted
 from cairn_map.wire.utc_times import with_utc
 
 DIGEST = re.compile("[0-9a-f]{64}")
@@ -174,6 +176,7 @@ def _add_retract(commands: Subparsers) -> None:
         what, side = part.split("_")
         when = f"all that was {what} {side} a time, UTC: 14:05, 2026-11-20T14:05"
         retract.add_argument(f"--{what}-{side}", metavar="TIME", help=when)
+    retract.add_argument("--all-layers", action="store_true", help="in all layers of the map, not its first one alone")
     retract.add_argument("--dry-run", action="store_true", help="list the commits, and change nothing")
     retract.add_argument("--note", default="", help="the reason; kept in the log")
 
@@ -190,14 +193,43 @@ def _retract(args: argparse.Namespace) -> int:
         **{f"{part}_s": seconds_of(getattr(args, part)) for part in TIMES},
     )
     with api:
-        done = api.retract(name, request)
-    if done.id is None:
-        say(f"would take out {len(done.commits)} commits (nothing was done):")
-    else:
-        say(f"{done.id} takes out {len(done.commits)} commits:")
-    for commit in done.commits:
-        say(f"  {commit}")
+        done = _retracted(api, name, request, all_layers=args.all_layers)
+    for layer, each in done.items():
+        where = f" of {layer}" if args.all_layers else ""
+        if each.id is None:
+            say(f"would take out {len(each.commits)} commits{where} (nothing was done):")
+        else:
+            say(f"{each.id} takes out {len(each.commits)} commits{where}:")
+        for commit in each.commits:
+            say(f"  {commit}")
     return 0
+
+
+def _retracted(api: MapApi, name: str, request: Retract, *, all_layers: bool) -> dict[str, Retracted]:
+    """Retracts by the name of the map, or of each layer that has such commits.
+
+    Each layer is a log of its own, so a retract is one commit in each; after a failure the same command goes on.
+
+    Raises:
+        NotFoundError: kind `nothing_to_retract`: none has any.
+        BadInputError: kind `bad_option`: commits of all layers are named by what they have in common, not one by one.
+    """
+    if not all_layers:
+        return {name: api.retract(name, request)}
+    if request.commits:
+        raise BadInputError("bad_option", "--commit names a commit of one layer: give the layer's URL, MAP.LAYER")
+    done: dict[str, Retracted] = {}
+    nothing: NotFoundError | None = None
+    for layer in layers_of(api, name).values():
+        try:
+            done[layer] = api.retract(layer, request)
+        except NotFoundError as exc:
+            if exc.kind != "nothing_to_retract":
+                raise
+            nothing = exc
+    if not done and nothing is not None:
+        raise nothing
+    return done
 
 
 def rig_digest(text: str) -> str:

@@ -11,6 +11,8 @@ poses, and takes the place of the old one: as they sync, all maps become the one
 the start, byte for byte. A robot keeps scans with --keep-scans MB (`cairn robot run`, `replay`, `live`); amend needs no
 link.
 
+The folder of a `LayeredRobot` has one for each layer: those that it maps into are amended one after the other.
+
 A scan's pose is interpolated between neighbours at most --max-pose-gap apart. If the trajectory does not cover all
 scans, nothing is moved and the message says how many are outside and where; --skip-bad moves the measurements that are
 covered whole, and leaves the others where they are. A map whose z axis was found with --up or --T-map-world needs the
@@ -28,7 +30,8 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
-from cairn_calib.rig.rig import load_rig
+from cairn_calib.rig.poses import Transform
+from cairn_calib.rig.rig import Rig, load_rig
 from cairn_client.cli.arguments import Subparsers, say
 from cairn_client.cli.pose_arguments import add_trajectory_arguments, pose_options
 from cairn_client.cli.robots.left_measurements import (
@@ -40,6 +43,7 @@ from cairn_client.cli.robots.left_measurements import (
 )
 from cairn_client.cli.source_arguments import add_up_arguments
 from cairn_client.folders.kept_folder import KeptFolder, kept_folder
+from cairn_client.folders.state_folder import layer_folders
 from cairn_client.folders.trajectory_amends import (
     MovePlan,
     head_of,
@@ -48,7 +52,7 @@ from cairn_client.folders.trajectory_amends import (
     plan_moves,
     trajectory_poses,
 )
-from cairn_fusion.recording.frame_poses import read_frame_poses
+from cairn_fusion.recording.frame_poses import PoseOptions, read_frame_poses
 from cairn_fusion.recording.turned_source import map_from_world
 from cairn_map.codec.cell_code import Profile
 from cairn_map.progress import with_progress
@@ -108,12 +112,21 @@ def _amend(args: argparse.Namespace) -> int:
     turn = map_from_world(up=args.up, T_map_world=args.T_map_world)
     options = pose_options(args)
     assert options is not None  # noqa: S101 - the option is required
+    T_map_world = None if turn is None else turn[0]
+    raise_left([_amend_folder(args, folder, options, given, T_map_world) for folder in layer_folders(args.folder)])
+    return 0
+
+
+def _amend_folder(
+    args: argparse.Namespace, folder: Path, options: PoseOptions, given: Rig | None, T_map_world: Transform | None
+) -> LeftMeasurements:
+    """Amend the measurements of one folder; those that stay as they are."""
     start_s = time.monotonic()
-    with kept_folder(args.folder) as opened:
+    with kept_folder(folder) as opened:
         # Everything that can be refused is, before anything is written.
         plan = kept_measurements(opened)
         found = read_frame_poses(options, head_of(opened, plan, given, of=options.of))
-        plan_moves(opened, plan, trajectory_poses(found, None if turn is None else turn[0]), given)
+        plan_moves(opened, plan, trajectory_poses(found, T_map_world), given)
         if not args.json:
             for note in dict.fromkeys(found.report()):
                 say(note)
@@ -124,10 +137,9 @@ def _amend(args: argparse.Namespace) -> int:
         report = _report(opened, plan, is_dry=args.dry_run)
     _say(plan, report, as_json=args.json, is_dry=args.dry_run)
     if not args.json and not args.dry_run:
-        sync = f"; push them: cairn robot sync {args.folder}" if report.waiting else ""
+        sync = f"; push them: cairn robot sync {folder}" if report.waiting else ""
         say(f"took {time.monotonic() - start_s:.1f} s{sync}")
-    raise_left([_left(plan)])
-    return 0
+    return _left(plan)
 
 
 def _report(opened: KeptFolder, plan: MovePlan, *, is_dry: bool) -> AmendReport:

@@ -28,6 +28,10 @@ cells that share more than a face with this box; and in short replies: with --re
 commits that take more work and four tenths fewer bytes, and sends them in parts of 16 kB, so that a link that breaks
 goes on where it stopped. On every link the cells around the robot come first.
 
+`replay`, `run` and `live` map into the map's first layer; `--layer fine` names another (`cairn map layer`), in a folder
+of its own, and `--assigned` takes the one that operators assigned to the robot. `--layer` of a command asks for a layer
+that is there: a robot makes none.
+
 `run` maps the recordings that a driver puts into a folder, and syncs, until a signal ends it. `live` maps what a robot
 with ROS sees, through its Foxglove bridge, as it sees it. `status` and `queue` look
 into a robot's folder, also while the robot is at work. `amend` moves past measurements to the poses of a

@@ -37,6 +37,7 @@ from pathlib import Path
 from cairn_client.cli.arguments import Subparsers
 from cairn_client.cli.range_arguments import add_ranges
 from cairn_client.cli.robot_arguments import add_gate, add_kept_scans, add_limits, add_map
+from cairn_client.cli.robots.layer_option import add_layer_option
 from cairn_map.codec.cell_code import Profile
 from cairn_map.errors import BadInputError
 
@@ -47,6 +48,7 @@ def add_parser(commands: Subparsers) -> None:
     live.add_argument("source", metavar="SOURCE", help="ws://HOST:PORT of its Foxglove bridge, or another door")
     live.add_argument("--ca", type=Path, metavar="FILE", help="issuer of the certificate of wss:// (this machine's)")
     add_map(live)
+    add_layer_option(live)
     live.add_argument("--voxel", type=float, metavar="METRES", help="make the map with this voxel edge if needed")
     live.add_argument("--topics", type=Path, metavar="YAML", help="meaning of the topics; see inspect")
     add_ranges(live)

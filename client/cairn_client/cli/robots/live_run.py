@@ -3,13 +3,13 @@
 import argparse
 import sys
 import time
-from pathlib import Path
 
 from cairn_calib.rig.rig import Spectrum
 from cairn_client.cli.arguments import say, shown_bytes
 from cairn_client.cli.event_lines import Stopping, lines_on_stderr, until_signal
 from cairn_client.cli.range_arguments import integrator_of, returns_line
 from cairn_client.cli.robot_arguments import gate_of, kept_scans_bytes, limits_of, scope_of
+from cairn_client.cli.robots.layer_option import bring_keys, choose_layer
 from cairn_client.cli.robots.replay import default_name, ensure_map
 from cairn_client.live.live_doors import open_door
 from cairn_client.live.live_mapping import LiveMapping
@@ -59,14 +59,17 @@ def run_live(args: argparse.Namespace) -> int:
             opened = open_live(source, mapping)
             recorder = None if args.record is None else ScanRecorder(args.record, opened, mapping)
             name = args.name or default_name(mapping.name)
+            choose_layer(args, name)
+            layer = _layer_of(args, mapping)
+            bring_keys(args.state, name, args.map)
             robot = Robot(
                 opened.rig,
                 args.map,
-                directory=args.state or Path(f"cairn-{name}"),
+                directory=args.state,
                 name=name,
                 token=args.token.of(args.map),
                 mode=args.mode,
-                geometry=_layer_of(args, mapping),
+                geometry=layer,
                 integrator=integrator_of(args),
                 scope=scope_of(args, args.mode),
                 limits=limits,

@@ -12,6 +12,7 @@ import numpy as np
 from cairn_client.cli.arguments import Subparsers, api_of, say, shown_bytes, shown_length
 from cairn_client.cli.range_arguments import add_ranges, integrator_of, returns_line
 from cairn_client.cli.robot_arguments import add_gate, add_kept_scans, add_map, gate_of, kept_scans_bytes, scope_of
+from cairn_client.cli.robots.layer_option import add_layer_option, bring_keys, choose_layer
 from cairn_client.cli.source_arguments import add_source_arguments, asked_source
 from cairn_client.http.api import MapApi
 from cairn_client.robot.robot import Robot
@@ -24,6 +25,7 @@ from cairn_fusion.recording.view_agreement import pose_doubt
 from cairn_fusion.recording.way_doubts import way_doubts
 from cairn_map.codec.cell_code import Profile
 from cairn_map.commits.commit import Commit
+from cairn_map.commits.ids import map_of_layer
 from cairn_map.epochs.epoch import STANDARD_EPOCH_S
 from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import BadInputError, DamagedDataError, NotFoundError, UnreachableError
@@ -45,9 +47,10 @@ def _replay(args: argparse.Namespace) -> int:
     source = asked_source(args.recording, args, scans_per_measurement=size)
     _say_range(source)
     _say_doubts(source, args)
-    layer = ensure_map(args, partial(channels_of, source))
     name = args.name or default_name(source.name)
-    state = args.state or Path(f"cairn-{name}")
+    choose_layer(args, name)
+    layer = ensure_map(args, partial(channels_of, source))
+    state: Path = args.state
     part = f"{args.recording.resolve()} {args.share[0]}/{args.share[1]}"
     if not args.again and part in _replayed(state):
         raise BadInputError(
@@ -59,6 +62,7 @@ def _replay(args: argparse.Namespace) -> int:
     is_open = size is None and all(len(stop) == 1 for stop in stops)
     grouping = Grouping() if source.has_times else Grouping(seconds_max=None)
     group = OpenGroup(grouping) if is_open else None
+    bring_keys(state, name, args.map)
     start_s = time.monotonic()
     scans = sum(map(len, stops))
     with Robot(
@@ -214,7 +218,7 @@ def _ensured(
             return None
         return MapLayer(geometry=geometry_for(voxel_edge_m=args.voxel, channels=channels()))
     except NotFoundError as exc:
-        if exc.kind != "no_map":
+        if exc.kind != "no_map" or map_of_layer(name) is not None:  # an operator adds layers, never a robot
             raise
         if args.voxel is None:
             raise BadInputError(
@@ -249,6 +253,7 @@ def add_parser(commands: Subparsers) -> None:
     """Add the subcommand."""
     replay = commands.add_parser("replay", help="map a recording", description="map a recording")
     add_map(replay)
+    add_layer_option(replay)
     replay.add_argument(
         "recording", type=Path, help="recording folder, known published layout, folder of point clouds, or bag of ROS"
     )

@@ -26,6 +26,7 @@ from cairn_client.cli.arguments import Subparsers, say, shown_bytes
 from cairn_client.cli.event_lines import Stopping, lines_on_stderr, until_signal
 from cairn_client.cli.range_arguments import add_ranges, integrator_of, returns_line
 from cairn_client.cli.robot_arguments import add_kept_scans, add_limits, add_map, kept_scans_bytes, limits_of, scope_of
+from cairn_client.cli.robots.layer_option import add_layer_option, bring_keys, choose_layer
 from cairn_client.cli.robots.replay import channels_of, default_name, ensure_map
 from cairn_client.folders.spool import Spool, Stop, remember
 from cairn_client.folders.state_folder import is_state_folder
@@ -58,6 +59,7 @@ def add_parser(commands: Subparsers) -> None:
     )
     run.add_argument("spool", type=Path, metavar="SPOOL", help="the folder that recordings come into")
     add_map(run)
+    add_layer_option(run)
     run.add_argument("--voxel", type=float, metavar="METRES", help="make the map with this voxel edge if needed")
     add_ranges(run)
     run.add_argument("--state", type=Path, metavar="DIR", help="the robot's folder (cairn-NAME)")
@@ -114,12 +116,15 @@ def _run(args: argparse.Namespace) -> int:
 def _robot(args: argparse.Namespace, spool: Spool, stopping: Stopping) -> Robot | None:
     """The robot; one that knows no map yet waits for the first recording, whose channels the map needs."""
     name = args.name or default_name(args.spool.resolve().name)
-    state: Path = args.state or Path(f"cairn-{name}")
+    choose_layer(args, name)
+    state: Path = args.state
     source = spool.next_recording()
     while source is None and not is_state_folder(state):
         if stopping.wait(LOOK_EVERY_S):
             return None
         source = spool.next_recording()
+    layer = ensure_map(args, partial(channels_of, source)) if source else None
+    bring_keys(state, name, args.map)
     return Robot(
         source.rig if source else None,
         args.map,
@@ -127,7 +132,7 @@ def _robot(args: argparse.Namespace, spool: Spool, stopping: Stopping) -> Robot 
         name=name,
         token=args.token.of(args.map),
         mode=args.mode,
-        geometry=ensure_map(args, partial(channels_of, source)) if source else None,
+        geometry=layer,
         integrator=integrator_of(args),
         scope=scope_of(args, args.mode),
         limits=limits_of(args),

@@ -29,8 +29,16 @@ class LayeredEnds:
     """(N,) metres; infinite where there is none."""
     points_m: Floats
     """(N, 3) where the ray ends, or the nearest point of the voxel, metres, map frame; NaN where there is none."""
-    names: list[str | None]
-    """N names of the layers whose voxel it is; None where there is none."""
+    of_layer: Ints
+    """(N,) place in `layers` of the layer whose voxel it is, where there is one."""
+    layers: tuple[str, ...]
+    """Names of the layers, the finest first."""
+
+    @property
+    def names(self) -> list[str | None]:
+        """N names of the layers whose voxel it is; None where there is none."""
+        found = zip(self.of_layer.tolist(), self.hit.tolist(), strict=True)
+        return [self.layers[index] if is_hit else None for index, is_hit in found]
 
     @property
     def hit(self) -> npt.NDArray[np.bool_]:
@@ -49,7 +57,9 @@ def cast_layers(
     frozen = list(layers.values())
     # Checked once, and as one layer does; its ends are those of the finest layer, too.
     first = distance_queries.cast(frozen[0], origins_m, directions, max_range_m=max_range_m, ends_in_unknown=False)
-    N = len(first.states)
+    N, names = len(first.states), tuple(layers)
+    if len(frozen) == 1:
+        return LayeredEnds(first.distance_m, first.points_m, np.zeros(N, np.int64), names)
     origins, ways = (np.broadcast_to(np.asarray(each, np.float64), (N, 3)) for each in (origins_m, directions))
     units = distance_queries.units_of(ways)
     step_m = STEP_PART * frozen[0].geometry.voxel_edge_m
@@ -74,9 +84,8 @@ def cast_layers(
         rows, inside, answering, found_m = (each[~is_end] for each in (rows, inside, answering, found_m))
         at_m[rows] = found_m + 2 * step_m + _way_out_m(frozen, answering, inside, units[rows])
         rows = rows[at_m[rows] <= max_range_m]
-    names = list(layers)
     points = origins + units * np.where(np.isfinite(ends_m), ends_m, np.nan)[:, None]
-    return LayeredEnds(ends_m, points, [names[index] if index >= 0 else None for index in of_layer.tolist()])
+    return LayeredEnds(ends_m, points, of_layer, names)
 
 
 def nearest_of_layers(finest: Mapping[str, FrozenMap], points_m: npt.ArrayLike, *, radius_m: float) -> LayeredEnds:
@@ -89,12 +98,9 @@ def nearest_of_layers(finest: Mapping[str, FrozenMap], points_m: npt.ArrayLike, 
         distance_queries.nearest(frozen, points_m, State.OCCUPIED, radius_m=radius_m) for frozen in finest.values()
     ]
     distances = np.stack([nearest.distance_m for nearest in found])
-    best, names = distances.argmin(axis=0), list(finest)
+    best, places = distances.argmin(axis=0), np.stack([nearest.points_m for nearest in found])
     rows = np.arange(len(best))
-    places, distance_m = np.stack([nearest.points_m for nearest in found]), distances[best, rows]
-    known = np.isfinite(distance_m).tolist()
-    of_layer = [names[n] if is_known else None for n, is_known in zip(best.tolist(), known, strict=True)]
-    return LayeredEnds(distance_m, places[best, rows], of_layer)
+    return LayeredEnds(distances[best, rows], places[best, rows], best, tuple(finest))
 
 
 def _next_m(layer: FrozenMap, origins: Floats, units: Floats, at_m: Floats, max_range_m: float) -> Floats:

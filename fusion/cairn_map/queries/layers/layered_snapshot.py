@@ -258,6 +258,8 @@ class LayeredSnapshot:
     ) -> npt.NDArray[Any]:
         """(N,) answers, each of the layer that answers for the point."""
         points = as_points(points_m, "points")
+        if len(self._layers) == 1:  # it knows no more of unknown points than `unknown`
+            return ask(next(iter(self._layers.values())), points)
         answering = self._answering(points)
         found = np.full(len(points), unknown)
         for index, layer in enumerate(self._layers.values()):

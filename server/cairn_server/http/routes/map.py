@@ -1,12 +1,22 @@
 """Routes of maps, their layers, their log and their marks."""
 
+from collections.abc import Sequence
 from typing import Annotated
 
 from fastapi import APIRouter, Depends, Query, Response
 
 from cairn_map.commits.commit import EPOCH_VERSION
 from cairn_map.errors import BadInputError
-from cairn_map.wire.layer_messages import KINDS_FORMAT, LAYER_FORMAT, AddLayer, LayerAdded, LayerInfo, is_listed
+from cairn_map.wire.layer_messages import (
+    KINDS_FORMAT,
+    LAYER_FORMAT,
+    AddLayer,
+    Assignment,
+    LayerAdded,
+    LayerInfo,
+    RobotAssignment,
+    is_listed,
+)
 from cairn_map.wire.live_events import NAMES_MAX
 from cairn_map.wire.mark_messages import PAGE_MAX, MarkPage, MarkReceipt, MarkRequest
 from cairn_map.wire.messages import CreateMap, LogEntry, MapDeleted, MapInfo, MapSizes, Retract, Retracted
@@ -123,6 +133,49 @@ def add_layer(
     added = service.sync.layers.add(row, body, by=caller)
     response.status_code = 201 if added.commit is not None else 200
     return added
+
+
+@router.get("/maps/{name}/assignments", dependencies=[Depends(allowed(*READING, Role.ENROLLER))])
+def list_assignments(
+    service: Operations, row: Map, robot: Annotated[str | None, Query(max_length=32, description="of it alone")] = None
+) -> Sequence[RobotAssignment]:
+    """Layers that operators assigned to robots: of all by name, or of one; of a layer's map."""
+    return service.sync.layers.assignments(row, robot)
+
+
+@router.put(
+    "/maps/{name}/assignments/{robot}",
+    status_code=204,
+    openapi_extra=json_body(
+        Assignment,
+        example={
+            "contributes": [
+                {"layer": "evidence", "inside_m": [[0, 0, -1], [20, 12, 4]]},
+                {"layer": "ground", "outside_m": [[0, 0, -1], [20, 12, 4]]},
+            ],
+            "fetches": ["fine"],
+        },
+    ),
+)
+def assign_layers(
+    robot: str,
+    service: Operations,
+    row: Map,
+    caller: Annotated[Caller, Depends(allowed(Role.OPERATOR))],
+    body: Annotated[Assignment, json_of(Assignment)],
+) -> None:
+    """Assign to a robot the layers that it maps into, perhaps by place, and those that it fetches."""
+    service.acts.take(caller.name, is_admin=caller.role is Role.ADMIN)
+    service.sync.layers.assign(row, robot, body, by=caller)
+
+
+@router.delete("/maps/{name}/assignments/{robot}", status_code=204)
+def unassign_layers(
+    robot: str, service: Operations, row: Map, caller: Annotated[Caller, Depends(allowed(Role.OPERATOR))]
+) -> None:
+    """Leave a robot's layers to its own program again."""
+    service.acts.take(caller.name, is_admin=caller.role is Role.ADMIN)
+    service.sync.layers.unassign(row, robot, by=caller)
 
 
 @router.post(

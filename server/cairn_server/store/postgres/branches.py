@@ -21,7 +21,7 @@ _SELECT = "SELECT name, mode, sensors, cursor, last_seen_s, incarnation FROM bra
 
 
 class PgBranches:
-    """Branches, and `store.BranchNotes`."""
+    """Branches, and `branch_signs.BranchNotes`."""
 
     def __init__(self, connections: Connections, threads: WritingThreads) -> None:
         self._connections = connections
@@ -122,6 +122,23 @@ class PgBranches:
             " WHERE branch_status.heard_s <= excluded.heard_s"
         )
         self._threads.note(lambda connection: connection.execute(query, (status, heard_s, row.number, branch)))
+
+    def assign(self, row: MapRow, robot: str, assignment: str | None) -> None:
+        """Keep which layers of a map a robot takes part in, as JSON, or (None) no more; durable on return."""
+
+        def job(connection: Connection) -> None:
+            lock_head(connection, row)
+            connection.execute("DELETE FROM assignment WHERE map = %s AND robot = %s", (row.number, robot))
+            if assignment is not None:
+                connection.execute("INSERT INTO assignment VALUES (%s, %s, %s)", (row.number, robot, assignment))
+
+        self._connections.run(job)
+
+    def assignments(self, row: MapRow) -> dict[str, str]:
+        """Assignments of a map, by robot."""
+        query = "SELECT robot, assignment FROM assignment WHERE map = %s ORDER BY robot"
+        with self._connections.lent() as connection:
+            return dict(rows(connection, query, (row.number,)))
 
     def flush(self) -> None:
         """Return when all notes that were made are written."""

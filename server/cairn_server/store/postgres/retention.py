@@ -140,7 +140,7 @@ ROWS_MAX = 2000
 """Most rows that are removed by one statement."""
 ROW_BYTES = 1000
 """Bytes that a row counts for, besides those of its values: with its indexes."""
-AT_ONCE = ("head", "author", "branch", "branch_status", "branch_view", "lease", "settled")
+AT_ONCE = ("head", "author", "branch", "branch_status", "branch_view", "assignment", "lease", "settled")
 """Tables whose rows go when the map does: they are few, and without them nothing new comes."""
 LATER = {
     "touched": "layer, cell, seq",

@@ -433,6 +433,7 @@ CREATE TABLE attachment_part (
 );
 ALTER TABLE attachment_part ALTER COLUMN body SET STORAGE EXTERNAL;     -- pictures do not shrink
 """
+ASSIGNMENTS = 'CREATE TABLE assignment (map bigint, robot text COLLATE "C", assignment text, PRIMARY KEY (map, robot))'
 ATTACHMENTS_OLDEST = 12
 """Oldest step whose programs read a mark with an attachment."""
 BOUND_OLDEST = 4
@@ -452,7 +453,7 @@ STEPS = tuple(
     Step(sql, oldest=1)
     for sql in (
         *(FIRST, REPLICAS, SERVERS, OBJECTS, OWNED_OBJECTS, EPOCHS, CLOCK, ADDRESSES, GONE, MARKS, LAYERS),
-        ATTACHMENTS,
+        *(ATTACHMENTS, ASSIGNMENTS),
     )
 )
 

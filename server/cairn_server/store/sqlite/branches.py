@@ -9,13 +9,14 @@ from cairn_map.commits.cursor import ENTRY_FOLD, cursor_from_text
 from cairn_map.commits.ids import Author
 from cairn_map.errors import UnreachableError
 from cairn_server.store.sqlite.readers import Readers
+from cairn_server.store.sqlite.retention import check_lives
 from cairn_server.store.sqlite.schema import MAPS
 from cairn_server.store.sqlite.writer import Writer, rows
 from cairn_server.store.store_rows import Branch, EntrySize, HeardRobot, MapRow
 
 
 class SqliteBranchNotes:
-    """`store.BranchNotes` over a store's connections."""
+    """`branch_signs.BranchNotes` over a store's connections."""
 
     def __init__(self, writer: Writer, readers: Readers) -> None:
         self._writer = writer
@@ -57,6 +58,23 @@ class SqliteBranchNotes:
             EntrySize(seq, Author(robot, incarnation) if kind == ENTRY_FOLD else None, size)
             for seq, kind, robot, incarnation, size in found
         ]
+
+    def assign(self, row: MapRow, robot: str, assignment: str | None) -> None:
+        """Keep which layers of a map a robot takes part in, as JSON, or (None) no more; durable on return."""
+
+        def job(connection: apsw.Connection) -> None:
+            check_lives(connection, row.number)
+            connection.execute("DELETE FROM assignment WHERE map = ? AND robot = ?", (row.number, robot))
+            if assignment is not None:
+                connection.execute("INSERT INTO assignment VALUES (?, ?, ?)", (row.number, robot, assignment))
+
+        self._writer.run(job)
+
+    def assignments(self, row: MapRow) -> dict[str, str]:
+        """Assignments of a map, by robot."""
+        query = "SELECT robot, assignment FROM assignment WHERE map = ? ORDER BY robot"
+        with self._readers.reading() as reader:
+            return dict(rows(reader, query, (row.number,)))
 
 
 def stored_branches(reader: apsw.Connection, row: MapRow, name: str | None = None) -> list[Branch]:

@@ -127,6 +127,7 @@ SMALL = {
     "vector_mark": "seq",
     "robot_key": "robot, incarnation",
     "branch": "name",
+    "assignment": "robot",
 }
 """Tables without blobs, with the rest of their keys, which begin with the map."""
 

@@ -394,6 +394,15 @@ CREATE TABLE attachment_part (
 );
 """
 
+ASSIGNMENTS = """
+CREATE TABLE assignment (
+    map INTEGER NOT NULL REFERENCES map,
+    robot TEXT NOT NULL,
+    assignment TEXT NOT NULL,       -- layers that it takes part in, as JSON
+    PRIMARY KEY (map, robot)
+) WITHOUT ROWID;
+"""
+
 STEPS = (
     FIRST,
     STAMPS,
@@ -417,6 +426,7 @@ STEPS = (
     MARKS,
     LAYERS,
     ATTACHMENTS,
+    ASSIGNMENTS,
 )
 
 

@@ -57,6 +57,7 @@ TABLES = {
     "robot_key": "robot, incarnation, is_proven, may_return, since_s, by",
     "branch": "name, mode, sensors, cursor, last_seen_s, incarnation",
     "branch_status": "name, status",
+    "assignment": "robot, assignment",
 }
 """Columns of the database by table, each after those that it refers to in an archive."""
 MAP = (

@@ -42,6 +42,7 @@ TABLES = (
     "robot_key",
     "branch",
     "branch_status",
+    "assignment",
 )
 """Tables of a map's rows, each after those that it refers to."""
 OF_MAP = {"diff": "commit_number IN (SELECT number FROM other.commits WHERE map = :of)"}
