@@ -106,7 +106,7 @@ clean:  ## remove .venv, build/ and all caches
 .venv-ros2/$(ROS2).stamp: pyproject.toml tests/ros2/$(ROS2).lock
 	$(PYTHON) -m venv --clear .venv-ros2/$(ROS2)
 	CAIRN_SKIP_CONSOLE=1 .venv-ros2/$(ROS2)/bin/pip install --quiet --disable-pip-version-check --editable '.[robot,live,server]' \
-		'pytest>=8.3' 'pytest-timeout>=2.3' 'foxglove-sdk>=0.30,<1'
+		'pytest>=8.3' 'pytest-timeout>=2.3' 'hypothesis>=6.115' 'foxglove-sdk>=0.30,<1'
 	.venv-ros2/$(ROS2)/bin/pip install --quiet --disable-pip-version-check --require-hashes --no-deps --requirement tests/ros2/$(ROS2).lock
 	touch $@
 

@@ -16,6 +16,7 @@ from tests.fixtures.fusion.live_drive import drive, wire_of
 from tests.fixtures.fusion.ros2_messages import MESSAGES, rosbags_message, store, vectors, without_padding
 
 from cairn_client.live.live_doors import open_door
+from cairn_client.publish.map_publisher import path_topic
 from cairn_client.publish.ros2_sink import Ros2Sink
 from cairn_fusion.mapping.scan_gate import ScanGate
 from cairn_fusion.ros.map_messages import MapMessage, RobotPose, grid_message, path_message
@@ -130,7 +131,7 @@ def published() -> list[MapMessage]:
     time_ns = 1_700_000_000_123_456_789
     return [
         grid_message("/map", floor, "map", time_ns),
-        path_message("/cairn/robots/mole/path", [pose], "map", time_ns),
+        path_message(path_topic("2-mole"), [pose], "map", time_ns),
     ]
 
 
@@ -169,7 +170,7 @@ def test_a_node_gets_what_is_published_late_and_codes_it_to_our_bytes(message: M
     came: list[bytes] = []
     with Ros2Sink(domain=DOMAIN) as sink:
         sink.send(message._replace(topic="/tf"))
-        sink.send(message._replace(topic="/cairn/robots/mole-2/path"))  # no name of ROS
+        sink.send(message._replace(topic="/cairn/octomap", type_name="octomap_msgs/msg/Octomap"))  # no package here
         sink.send(message)
         node = rclpy.create_node("nav2", context=context)
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)

@@ -17,7 +17,7 @@ Topics, all in the frame `map` (--frame), lengths in metres, temperatures in deg
     /cairn/marks                visualization_msgs/MarkerArray: what robots and people marked
     /cairn/octomap              octomap_msgs/Octomap: occupied and free space, once, with --octomap
     /tf                         tf2_msgs/TFMessage: robots that report where they are, each the frame of its name
-    /cairn/robots/NAME/path     nav_msgs/Path: the way of one since publishing began, at most every 3 s
+    /cairn/robots/NAME/path     nav_msgs/Path: the way of one since publishing began, every 3 s; its name has _ for -
 
 The storey of /map is that of --ground; without it the largest one, chosen again after each change, but left only for
 one with twice its free area. A viewer that joins late gets the newest message of each topic at once.
@@ -60,6 +60,7 @@ if TYPE_CHECKING:
     from cairn_client.publish.followed_map import FollowedMap
     from cairn_client.publish.map_publisher import MapPublisher, Sink
     from cairn_client.publish.mcap_file import McapFile
+    from cairn_client.publish.zenoh_sink import ZenohSink
 
 ADDRESS = re.compile(r"(?:(?P<host>[^\s:]+|\[[0-9a-fA-F:]+\]):)?(?P<port>\d{1,5})")
 ORIGIN = re.compile(r"https?://[^\s/]+/?", re.IGNORECASE)
@@ -119,9 +120,6 @@ def _open_sinks(args: argparse.Namespace, name: str, open_parts: ExitStack) -> "
         from cairn_client.publish.foxglove_server import FoxgloveServer
         from cairn_client.publish.mcap_file import McapFile
         from cairn_client.publish.ros2_sink import Ros2Sink
-
-        if args.zenoh is not None:
-            from cairn_client.publish.zenoh_sink import ZenohSink
     except ModuleNotFoundError as exc:
         raise _missing_extra(exc) from exc
     sinks: list[Sink] = []
@@ -134,7 +132,7 @@ def _open_sinks(args: argparse.Namespace, name: str, open_parts: ExitStack) -> "
         sinks.append(open_parts.enter_context(BridgeSink(args.through, ca_file=args.ca)))
         _say_at_once(f"{name} through {args.through}")
     if args.zenoh is not None:
-        sinks.append(open_parts.enter_context(ZenohSink(args.zenoh)))
+        sinks.append(open_parts.enter_context(_zenoh_sink(args.zenoh)))
         _say_at_once(f"{name} through {args.zenoh}")
     if args.ros2:
         sinks.append(open_parts.enter_context(Ros2Sink()))
@@ -147,8 +145,15 @@ def _open_sinks(args: argparse.Namespace, name: str, open_parts: ExitStack) -> "
     return sinks
 
 
-def _missing_extra(exc: ModuleNotFoundError) -> BadInputError:
-    extras = "robot,live" if exc.name == "zenoh" else "robot"
+def _zenoh_sink(url: str) -> "ZenohSink":
+    try:
+        from cairn_client.publish.zenoh_sink import ZenohSink
+    except ModuleNotFoundError as exc:
+        raise _missing_extra(exc, "robot,live") from exc
+    return ZenohSink(url)
+
+
+def _missing_extra(exc: ModuleNotFoundError, extras: str = "robot") -> BadInputError:
     return BadInputError("missing_extra", f'publishing needs {exc.name}: pip install "cairn-robotics[{extras}]"')
 
 

@@ -7,9 +7,7 @@ subscription that is refused because the bridge does not know its own channel ye
 """
 
 import logging
-import threading
 import time
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,8 +27,8 @@ from cairn_client.live.foxglove_frames import (
     unsubscribe_text,
 )
 from cairn_client.live.inbox import Inbox
-from cairn_client.live.live_source import bad_url
-from cairn_fusion.ros.bag import BagMessage, Topic
+from cairn_client.live.live_source import LiveSource, bad_url
+from cairn_fusion.ros.bag import Topic
 from cairn_map.errors import DamagedDataError
 
 log = logging.getLogger(__name__)
@@ -57,8 +55,8 @@ class _Subscription:
     messages: int = 0
 
 
-class FoxgloveSource:
-    """Live source behind one URL; its messages are taken by one thread."""
+class FoxgloveSource(LiveSource):
+    """Live source behind one bridge."""
 
     def __init__(
         self,
@@ -81,18 +79,8 @@ class FoxgloveSource:
         """
         if not is_bridge_url(url):
             raise bad_url(url)
-        self.url = url
+        super().__init__(url, inbox=inbox, steady_s=steady_s)
         self._links = BridgeLinks(url, ca_file, self._use, pauses_s=AGAIN_S, name="cairn-live")
-        self.links = 0
-        """Times that a link was made."""
-        self.damaged = 0
-        """Frames that were none of the protocol."""
-        self.lost_since_s: float | None = None
-        """Steady time since which there is no link; None: there is one."""
-        self._inbox = inbox or Inbox()
-        self._steady_s = steady_s
-        self._lock = threading.Lock()
-        self._wanted: Callable[[Topic], bool] = lambda topic: False
         self._channels: dict[int, Topic] = {}
         self._subscriptions: dict[str, _Subscription] = {}
         self._by_number: dict[int, str] = {}
@@ -104,45 +92,19 @@ class FoxgloveSource:
         with self._lock:
             return {topic.name: topic for topic in self._channels.values()}
 
-    @property
-    def counts(self) -> Counter[str]:
-        """Messages that came, by topic."""
-        return self._inbox.counts
-
-    @property
-    def dropped(self) -> Counter[str]:
-        """Messages that went for room here, by topic."""
-        return self._inbox.dropped
-
-    def open(self, wanted: Callable[[Topic], bool]) -> None:
-        """Connect, and receive from here on, in a thread of its own.
-
-        Args:
-            wanted: True of the topics whose messages are wanted; asked about each that is offered, whenever it is.
-
-        Raises:
-            BadInputError: kind `no_bridge`: nothing answers there; kind `no_foxglove`: something else does.
-        """
-        self._wanted = wanted
+    def _connect(self) -> None:
         self._links.start()
 
-    def take(self, *, within_s: float) -> list[BagMessage]:
-        """All messages that wait, as soon as there are any."""
-        return self._inbox.take(within_s=within_s)
-
-    def close(self) -> None:
-        """End the link; what waits may still be taken."""
-        self._inbox.close()
+    def _disconnect(self) -> None:
         self._links.stop()
 
     def _use(self, link: ClientConnection) -> None:
         """Receive over one link."""
-        self.links += 1
-        self.lost_since_s = None
+        self._note_link(is_there=True)
         try:
             self._listen(link)
         finally:
-            self.lost_since_s = self._steady_s()
+            self._note_link(is_there=False)
             with self._lock:
                 self._channels, self._subscriptions, self._by_number = {}, {}, {}
 

@@ -2,8 +2,8 @@
 
     messages -> LiveScans -> backlog -> gate -> decode -> Robot.observe -> commit after 50 scans, 5 s or 2 m
 
-A robot that is slower than its cameras takes the newest scans: those that wait longer than a second go, and are
-counted. So arrived = taken + not moved + dropped + left out by cause + waiting, at any time. Where the disk or the
+A robot that is slower than its cameras takes the newest scans: those that wait longer than half a second go, and
+are counted. So arrived = taken + not moved + dropped + left out by cause + waiting, at any time. Where the disk or the
 outbox is full, mapping goes on in the open measurement. Past measurements follow a SLAM's corrections in between.
 """
 
@@ -28,8 +28,9 @@ log = logging.getLogger(__name__)
 
 TOO_LARGE = "too_large"
 """Kind of the error of a measurement that can be no commit."""
-BEHIND_S = 1.0
-"""Wait from which on a scan gives way to newer ones."""
+BEHIND_S = 0.5
+"""Wait from which on a scan gives way to newer ones: where cameras bring more scans than are mapped, each one waits so
+long, and with its way here and its own mapping it must be in the robot's map within a second (`tests.bench`, live)."""
 REST_S = 5.0
 """Time without a scan after which the open measurement is committed."""
 FINISH_S = 1.0

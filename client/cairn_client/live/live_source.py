@@ -8,10 +8,13 @@ A door says which topics there are and brings the messages of those that are wan
 of cameras and maps: one assembler decides for all doors (`cairn_fusion.ros.live_scans`).
 """
 
+import threading
+import time
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable
-from typing import Protocol
 
+from cairn_client.live.inbox import Inbox
 from cairn_fusion.ros.bag import BagMessage, Topic
 from cairn_map.errors import BadInputError
 
@@ -23,43 +26,46 @@ URL_HELP = (
 )
 
 
-class LiveSource(Protocol):
-    """Live source behind one URL; its messages are taken by one thread."""
+class LiveSource(ABC):
+    """Live source behind one URL; its messages are taken by one thread.
 
-    @property
-    def url(self) -> str:
-        """The URL, as it was given."""
-        ...
+    A door is a subclass: a thread of its own puts the messages of what is `_wanted` into `_inbox`.
+    """
 
-    @property
-    def links(self) -> int:
+    def __init__(self, url: str, *, inbox: Inbox | None = None, steady_s: Callable[[], float] = time.monotonic) -> None:
+        """Open nothing yet.
+
+        Args:
+            url: of the source, as it was given.
+            inbox: takes the messages.
+            steady_s: clock.
+        """
+        self.url = url
+        self.links = 0
         """Times that a link was made."""
-        ...
-
-    @property
-    def damaged(self) -> int:
+        self.damaged = 0
         """Frames that were none of the protocol."""
-        ...
-
-    @property
-    def lost_since_s(self) -> float | None:
+        self.lost_since_s: float | None = None
         """Steady time since which there is no link; None: there is one."""
-        ...
+        self._inbox = inbox or Inbox()
+        self._steady_s = steady_s
+        self._lock = threading.Lock()
+        self._wanted: Callable[[Topic], bool] = lambda topic: False
 
     @property
+    @abstractmethod
     def topics(self) -> dict[str, Topic]:
         """Topics that are offered now, by name."""
-        ...
 
     @property
     def counts(self) -> Counter[str]:
         """Messages that came, by topic."""
-        ...
+        return self._inbox.counts
 
     @property
     def dropped(self) -> Counter[str]:
         """Messages that were lost on the way here, as far as the door numbers them, or went for room; by topic."""
-        ...
+        return self._inbox.dropped
 
     def open(self, wanted: Callable[[Topic], bool]) -> None:
         """Connect, and receive from here on.
@@ -70,15 +76,36 @@ class LiveSource(Protocol):
         Raises:
             BadInputError: kind `no_bridge` or another: nothing answers there that brings messages.
         """
-        ...
+        self._wanted = wanted
+        self._connect()
 
     def take(self, *, within_s: float) -> list[BagMessage]:
         """All messages that wait, as soon as there are any."""
-        ...
+        return self._inbox.take(within_s=within_s)
 
     def close(self) -> None:
         """End the link; what waits may still be taken."""
-        ...
+        self._inbox.close()
+        self._disconnect()
+
+    def _note_link(self, *, is_there: bool) -> None:
+        """Note whether there is a link now."""
+        if is_there and (not self.links or self.lost_since_s is not None):
+            self.lost_since_s, self.links = None, self.links + 1
+        elif not is_there and self.lost_since_s is None:
+            self.lost_since_s = self._steady_s()
+
+    @abstractmethod
+    def _connect(self) -> None:
+        """Connect, and begin to receive in a thread.
+
+        Raises:
+            BadInputError: see `open`.
+        """
+
+    @abstractmethod
+    def _disconnect(self) -> None:
+        """End the thread and the link, if there are any."""
 
 
 def bad_url(url: str) -> BadInputError:

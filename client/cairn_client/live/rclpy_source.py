@@ -12,15 +12,14 @@ import importlib
 import logging
 import threading
 import time
-from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
 from cairn_client.links.link_url import domain_of
 from cairn_client.links.ros2_node import Ros2Node, message_type
 from cairn_client.live.inbox import Inbox
-from cairn_client.live.live_source import bad_url
-from cairn_fusion.ros.bag import BagMessage, Topic, Wire
+from cairn_client.live.live_source import LiveSource, bad_url
+from cairn_fusion.ros.bag import Topic, Wire
 from cairn_fusion.ros.messages import CLOUDS, COMPRESSED, IMAGE, plain_type
 
 log = logging.getLogger(__name__)
@@ -36,7 +35,7 @@ IMAGES, SMALL = 10, 500
 LARGE = frozenset([IMAGE, COMPRESSED]) | CLOUDS
 
 
-class RclpySource:
+class RclpySource(LiveSource):
     """Live source of the ROS 2 of this machine."""
 
     def __init__(self, url: str, *, inbox: Inbox | None = None, steady_s: Callable[[], float] = time.monotonic) -> None:
@@ -52,15 +51,7 @@ class RclpySource:
             raise bad_url(url) from exc
         if scheme != SCHEME:
             raise bad_url(url)
-        self.url = url
-        self.links = 0
-        self.damaged = 0
-        """Always 0: ROS reads its own frames."""
-        self.lost_since_s: float | None = None
-        """Always None: there is no link to lose; topics come and go."""
-        self._inbox = inbox or Inbox()
-        self._lock = threading.Lock()
-        self._wanted: Callable[[Topic], bool] = lambda topic: False
+        super().__init__(url, inbox=inbox, steady_s=steady_s)
         self._topics: dict[str, Topic] = {}
         self._subscriptions: dict[str, tuple[tuple[str, bool, bool], Any]] = {}
         """Subscription of each topic, with its type, and whether it is reliable and latched."""
@@ -75,36 +66,14 @@ class RclpySource:
         with self._lock:
             return dict(self._topics)
 
-    @property
-    def counts(self) -> Counter[str]:
-        """Messages that came, by topic."""
-        return self._inbox.counts
-
-    @property
-    def dropped(self) -> Counter[str]:
-        """Messages that went for room here, by topic."""
-        return self._inbox.dropped
-
-    def open(self, wanted: Callable[[Topic], bool]) -> None:
-        """Join the network of ROS, and receive from here on, in a thread of its own.
-
-        Raises:
-            BadInputError: kind `no_ros2`: there is none in this Python.
-        """
-        self._wanted = wanted
+    def _connect(self) -> None:
         node = Ros2Node(NODE, domain=self._domain)
-        self.links = 1
+        self._note_link(is_there=True)
         self._thread = threading.Thread(target=self._receive, args=(node,), name="cairn-live", daemon=True)
         self._thread.start()
 
-    def take(self, *, within_s: float) -> list[BagMessage]:
-        """All messages that wait, as soon as there are any."""
-        return self._inbox.take(within_s=within_s)
-
-    def close(self) -> None:
-        """Leave; what waits may still be taken."""
+    def _disconnect(self) -> None:
         self._closing.set()
-        self._inbox.close()
         if self._thread is not None:
             self._thread.join(CLOSE_S)
 
@@ -121,7 +90,7 @@ class RclpySource:
                 executor.spin_once(timeout_sec=SPIN_S)
         except Exception:
             log.exception("ROS 2 has ended")
-            self.lost_since_s = time.monotonic()
+            self._note_link(is_there=False)
         finally:
             executor.shutdown()
             node.close()

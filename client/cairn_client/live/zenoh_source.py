@@ -21,8 +21,8 @@ from zenoh import ext
 from cairn_client.links.zenoh_keys import Publisher, publisher_of, tokens_of
 from cairn_client.links.zenoh_link import CONNECT_S, LOOK_S, is_linked, open_session, router_of
 from cairn_client.live.inbox import Inbox
-from cairn_client.live.live_source import bad_url
-from cairn_fusion.ros.bag import BagMessage, Topic
+from cairn_client.live.live_source import LiveSource, bad_url
+from cairn_fusion.ros.bag import Topic
 from cairn_fusion.ros.bag_index import STATIC_NAME
 
 log = logging.getLogger(__name__)
@@ -37,7 +37,7 @@ NUMBER = struct.Struct("<q")
 ATTACHMENT_BYTES = 33
 
 
-class ZenohSource:
+class ZenohSource(LiveSource):
     """Live source behind one router."""
 
     def __init__(self, url: str, *, inbox: Inbox | None = None, steady_s: Callable[[], float] = time.monotonic) -> None:
@@ -49,16 +49,8 @@ class ZenohSource:
         router = router_of(url)
         if router is None:
             raise bad_url(url)
+        super().__init__(url, inbox=inbox, steady_s=steady_s)
         self._router = router
-        self.url = url
-        self.links = 0
-        self.damaged = 0
-        """Always 0: zenoh reads its own frames."""
-        self.lost_since_s: float | None = None
-        self._inbox = inbox or Inbox()
-        self._steady_s = steady_s
-        self._lock = threading.Lock()
-        self._wanted: Callable[[Topic], bool] = lambda topic: False
         self._tokens: dict[str, Publisher] = {}
         self._subscribers: dict[str, Any] = {}
         """Subscriptions by key, those to the tokens included."""
@@ -77,25 +69,14 @@ class ZenohSource:
             return {publisher.topic.name: publisher.topic for publisher in reversed(list(self._tokens.values()))}
 
     @property
-    def counts(self) -> Counter[str]:
-        """Messages that came, by topic."""
-        return self._inbox.counts
-
-    @property
     def dropped(self) -> Counter[str]:
         """Messages that went for room here, or that the network lost by rmw_zenoh's own numbers; by topic."""
         with self._lock:
             return self._inbox.dropped + self._missed
 
-    def open(self, wanted: Callable[[Topic], bool]) -> None:
-        """Connect, and receive from here on.
-
-        Raises:
-            BadInputError: kind `no_router`: none answers there.
-        """
-        self._wanted = wanted
+    def _connect(self) -> None:
         self._session = open_session(self._router)
-        self.links = 1
+        self._note_link(is_there=True)
         for tokens in tokens_of(self._router.domain):
             self._subscribers[tokens] = self._session.liveliness().declare_subscriber(
                 tokens, self._take_token, history=True
@@ -103,15 +84,9 @@ class ZenohSource:
         self._thread = threading.Thread(target=self._look_after, name="cairn-live", daemon=True)
         self._thread.start()
 
-    def take(self, *, within_s: float) -> list[BagMessage]:
-        """All messages that wait, as soon as there are any."""
-        return self._inbox.take(within_s=within_s)
-
-    def close(self) -> None:
-        """End the link; what waits may still be taken."""
+    def _disconnect(self) -> None:
         self._closing.set()
         self._changed.set()
-        self._inbox.close()
         if self._thread is not None:
             self._thread.join(CONNECT_S + 1)
         if self._session is not None:
@@ -138,13 +113,6 @@ class ZenohSource:
                 self._note_link(is_there=is_linked(self._session))
             except zenoh.ZError as exc:
                 log.info("%s: %s", self.url, exc)
-
-    def _note_link(self, *, is_there: bool) -> None:
-        if is_there and self.lost_since_s is not None:
-            self.lost_since_s, self.links = None, self.links + 1
-        elif not is_there and self.lost_since_s is None:
-            self.lost_since_s = self._steady_s()
-            log.info("the link to %s is lost", self.url)
 
     def _subscribe_new(self) -> None:
         with self._lock:

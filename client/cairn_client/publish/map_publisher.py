@@ -204,7 +204,7 @@ class MapPublisher:
         if not way.is_new or self._steady_s() < way.due_s:
             return
         poses = way.poses if way.poses[-1] == way.newest else [*way.poses, way.newest]
-        self._send(path_message(f"/cairn/robots/{name}/path", poses, self._choice.frame, time.time_ns()))
+        self._send(path_message(path_topic(name), poses, self._choice.frame, time.time_ns()))
         way.due_s = self._steady_s() + PATH_S
         way.is_new = False
 
@@ -259,6 +259,12 @@ class MapPublisher:
     def _send(self, message: MapMessage) -> None:
         for sink in self._sinks:
             sink.send(message)
+
+
+def path_topic(robot: str) -> str:
+    """Topic of a robot's way: ROS takes no name with a hyphen, nor one that begins with a digit."""
+    name = robot.replace("-", "_")
+    return f"/cairn/robots/{f'_{name}' if name[0].isdigit() else name}/path"
 
 
 class _Way:

@@ -3,8 +3,7 @@
     source /opt/ros/jazzy/setup.bash
     cairn map publish URL --ros2
 
-Messages are handed to rclpy as they are coded. A topic for whose type this ROS has no package, or whose name holds a
-robot's that is none of ROS, is left out, and named once.
+Messages are handed to rclpy as they are coded. A topic for whose type this ROS has no package is left out, and named.
 """
 
 import logging
@@ -61,8 +60,4 @@ class Ros2Sink:
             log.warning("this ROS has no package for %s: %s is left out", message.type_name, message.topic)
             return None
         profile = self._node.quality(depth=1, is_reliable=True, is_latched=True)
-        try:
-            return self._node.node.create_publisher(kind, message.topic, profile)
-        except ValueError as exc:
-            log.warning("%s is left out: %s", message.topic, str(exc).splitlines()[0])
-            return None
+        return self._node.node.create_publisher(kind, message.topic, profile)

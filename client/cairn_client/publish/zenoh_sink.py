@@ -4,8 +4,8 @@
            -->  map                                                 nodes behind a bridge of DDS
 
 No ROS is needed here. A topic's newest message is kept for nodes that come late, as `rmw_zenoh` keeps it. Under a key
-that no node asks for nothing leaves this machine. Humble's nodes ask for keys without hashes: once one of them is on
-the network, messages go under these.
+that no node asks for, nothing leaves this machine but the first message. Humble's nodes ask for keys without hashes:
+once one of them is on the network, messages go under these.
 """
 
 import logging

@@ -16,7 +16,7 @@ from tests.naive.evidence import interleave
 from cairn_client.cli.maps.command import main
 from cairn_client.http.api import MapApi
 from cairn_client.publish.followed_map import FollowedMap
-from cairn_client.publish.map_publisher import PATH_S, POSES_MAX, STEP_M, FloorChoice, MapPublisher
+from cairn_client.publish.map_publisher import PATH_S, POSES_MAX, STEP_M, FloorChoice, MapPublisher, path_topic
 from cairn_fusion.ros.map_messages import MapMessage, definition_of
 from cairn_map.commits.commit import ScanPose
 from cairn_map.errors import NotFoundError, UnreachableError
@@ -192,6 +192,11 @@ def test_a_long_path_keeps_its_begin_and_a_bounded_number_of_poses(published: Pu
     places = [pose["pose"]["position"]["x"] for pose in path["poses"]]
     assert POSES_MAX / 2 <= len(places) <= POSES_MAX + 1
     assert (places[0], places[-1]) == (0.0, 0.06 * (count - 1))
+
+
+@pytest.mark.parametrize(("robot", "name"), [("mole", "mole"), ("mole-2", "mole_2"), ("2nd", "_2nd")])
+def test_topics_of_robots_are_names_that_ros_takes(robot: str, name: str) -> None:
+    assert path_topic(robot) == f"/cairn/robots/{name}/path"
 
 
 def test_marks_are_published_as_they_come_and_go(published: Published) -> None:
