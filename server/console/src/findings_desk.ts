@@ -53,7 +53,7 @@ export class FindingsDesk {
   readonly spots: HotSpotList;
   all: readonly Finding[] = [];
   isMarking = false;
-  private chosen: string | null = null;
+  chosen: string | null = null;
   /** A flight whose end is still to be looked at. */
   private flight: { place: Vector3; witness: Vector3 | null; left: number } | null = null;
   /** What a link names, until it is there. */
@@ -118,6 +118,12 @@ export class FindingsDesk {
     this.find();
   }
 
+  /** Choose a finding where one is: a reload, or Back; null: none. */
+  choose(id: string | null): void {
+    this.chosen = id;
+    this.update();
+  }
+
   /** Fly to the finding that a link names, as soon as it is known. */
   seek(id: string): void {
     this.sought = { id, endMs: performance.now() + SEEK_MS };
@@ -166,8 +172,7 @@ export class FindingsDesk {
   forget(): void {
     this.stopMarking();
     this.flight = null;
-    this.chosen = null;
-    this.update();
+    this.choose(null);
   }
 
   dispose(): void {

@@ -5,7 +5,7 @@ import type { LinkState } from "../live.ts";
 import { FIELDS, type Field } from "../look.ts";
 import type { MapInfo } from "../messages.ts";
 import { isClockTrusted } from "../server_time.ts";
-import { ago } from "../units.ts";
+import { ago, bytes, counted } from "../units.ts";
 
 const THEME_KEY = "cairn.theme";
 
@@ -19,7 +19,7 @@ export class TopBar {
   private readonly link = h("span", { class: "link", role: "status" });
 
   constructor(maps: readonly MapInfo[], map: string, loggedIn: boolean, on: { map: (name: string) => void; keys: () => void; share: () => void; logOut: () => void }) {
-    const choice = h("select", { "aria-label": "Map" }, ...maps.map(({ name }) => h("option", { value: name, selected: name === map }, name)));
+    const choice = h("select", { "aria-label": "Map" }, ...maps.map((info) => h("option", { value: info.name, selected: info.name === map }, choiceOf(info))));
     choice.addEventListener("change", () => on.map(choice.value));
     this.fields = h(
       "div", { class: "segments", role: "group", "aria-label": "Colour by" },
@@ -67,6 +67,11 @@ export class TopBar {
     this.link.dataset.state = state;
     fill(this.link, said);
   }
+}
+
+/** A map by what tells it from others. */
+function choiceOf({ name, cells, size_bytes, branches }: MapInfo): string {
+  return `${name} · ${counted(cells, "cell", "cells")}, ${bytes(size_bytes)}, ${counted(branches, "robot", "robots")}`;
 }
 
 /** Dark or light: as the system says, or as was chosen here. */
