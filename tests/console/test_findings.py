@@ -251,7 +251,8 @@ def test_an_alarm_is_seen_and_in_the_title_until_it_is_quiet(desk: Console) -> N
 def test_a_reload_keeps_what_is_measured_and_chosen_and_back_undoes_the_flight(desk: Console) -> None:
     page = desk.page
     page.keyboard.press("Escape")
-    desk.tell("(c.camera.home(), a[0].forEach((p) => c.measure.add(c.stage.controls.target.clone().set(...p))))", CORNERS)
+    desk.tell("c.camera.home()")
+    desk.tell("a[0].forEach((p) => c.measure.add(c.stage.controls.target.clone().set(...p)))", CORNERS)
     desk.settled()
     before = desk.tell("c.stage.view")
     rows(desk).nth(1).get_by_role("button").click()

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Literal
 
 import cv2
+import numpy as np
 import pytest
 from playwright.sync_api import Browser, ViewportSize
 from tests.console.browsing import OVERFLOWING, TABLET, VIEW, Console, findings_of_axe
@@ -30,6 +31,7 @@ SMALL = """(least) => [...document.querySelectorAll("button, select, summary, in
   .filter(([, {width, height}]) => Math.min(width, height) < least)
   .map(([e, {width, height}]) => `${width}x${height} ${e.outerHTML.slice(0, 80)}`)"""
 THEMES: tuple[Literal["dark", "light"], ...] = ("light", "dark")
+GROUNDS = {"dark": (14, 17, 22), "light": (238, 240, 243)}
 TABS = ("Findings", "Robots", "Tools", "Time", "Map")
 
 
@@ -64,7 +66,9 @@ def test_the_map_has_most_of_the_screen_and_nothing_is_cut_off(
         picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
         assert picture is not None
         bright.append(picture.mean())
-        assert fresh.picture().std() > 8, f"{theme}: the map is in the picture"
+        drawn = fresh.picture()
+        assert drawn.std() > 8, f"{theme}: the map is in the picture"
+        assert np.abs(drawn[-2, 2].astype(int) - GROUNDS[theme]).max() <= 1, "around it is the page's ground"
     assert bright[0] > bright[1] + 60, "light is light"
 
 

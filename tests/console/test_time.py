@@ -30,6 +30,8 @@ LOGS = 200
 NOTE = "the head was knocked"
 SHOWN = "[...c.cells.all.values()].filter(({ count }) => count).map(({ key, bytes }) => [key, [...bytes]])"
 STRIDE = 12
+ROOM, FAR = 0.8, 6
+"""Part of the map that has room: less than all at voxels, more than the first of its moments, so many steps back."""
 Nodes = dict[str, npt.NDArray[np.int64]]
 
 
@@ -129,6 +131,28 @@ def test_a_moment_seen_before_asks_the_server_for_nothing(console: Console) -> N
     assert [url for url in console.requests if "/main/cells" in url] == []
 
 
+def test_one_plan_of_depths_counts_for_all_moments_while_the_eye_rests(console: Console) -> None:
+    budget, whole = console.tell("[c.cells.budget, c.cells.drawn]")
+    console.tell("(c.cells.budget = a[0], c.replan())", int(ROOM * whole))
+    console.settled()
+    depths = "[...c.cells.all.values()].map(({ depth }) => depth)"
+    coarse = console.tell(depths)
+    assert max(coarse) < GEOMETRY.depth, "voxels have no room"
+    for by in (-FAR, FAR):
+        console.tell("c.time.step(a[0])", by)
+        console.settled()
+        console.until("!c.time.isLookingAhead", "what would come next is there, too")
+        assert console.tell(depths) == coarse, "though there was room for the voxels of the beginning"
+    console.requests.clear()
+    for by in (-FAR, FAR):
+        console.tell("c.time.step(a[0])", by)
+        assert console.tell("c.cells.waiting") == 0, "it is there at once"
+    assert [url for url in console.requests if "/main/cells" in url] == []
+    console.tell("(c.cells.budget = a[0], c.replan())", budget)
+    console.settled()
+    assert console.tell("c.cells.drawn") == whole
+
+
 def test_a_link_shows_the_same_moment_and_a_reload_stays_there(console: Console) -> None:
     moment = SIGHTS[2].time_s
     console.tell("c.time.show(a[0])", moment)
@@ -156,7 +180,7 @@ def test_times_are_those_of_a_zone_that_is_chosen_once(console: Console) -> None
     zone = page.get_by_role("region", name="Map").get_by_label("times in")
     assert zone.input_value() == "UTC"
     for name, hour in (("Asia/Tokyo", "17:5"), ("UTC", "08:5")):
-        with page.expect_navigation():
+        with page.expect_event("load"):
             zone.select_option(name)
         console.until("c.time.timeline.moments.length", "the page is there again")
         console.settled()

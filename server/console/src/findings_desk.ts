@@ -195,8 +195,6 @@ export class FindingsDesk {
   fly(id: string): void {
     const found = this.all.find((one) => one.id === id);
     if (!found) return;
-    this.chosen = id;
-    this.update();
     const place = new Vector3(...found.place);
     const where = `Finding ${found.number}: ${found.celsius === null ? found.title : `${found.celsius.toFixed(1)} °C`} at ${place.toArray().map((value) => value.toFixed(2)).join(", ")} m`;
     const hidden = !isShown(place);
@@ -208,13 +206,14 @@ export class FindingsDesk {
     }
     const from = found.spot?.commit ? this.acts.witness(found.spot.commit) : null;
     this.flight = { place, witness: from && new Vector3(...from), left: FLIGHTS_MAX };
-    this.go(this.flight);
+    this.acts.fly(this.view(this.flight));
+    this.choose(id); // after the flight began: Back leads to where it was not chosen
     this.acts.say(hidden ? `${where}. It was cut off: all heights are shown now.` : where);
   }
 
-  private go(flight: { place: Vector3; witness: Vector3 | null; left: number }): void {
+  private view(flight: { place: Vector3; witness: Vector3 | null; left: number }): CameraView {
     flight.left--;
-    this.acts.fly(visibleFrom(this.cells, flight.place, this.stage.camera.position, flight.witness));
+    return visibleFrom(this.cells, flight.place, this.stage.camera.position, flight.witness);
   }
 
   /** Where a flight has ended and finer voxels have come, look whether they hide what it was for, and go elsewhere then. */
@@ -229,7 +228,7 @@ export class FindingsDesk {
     const met = this.picker.at(clientWidth / 2, clientHeight / 2);
     const nearM = (NEAR_VOXELS * this.info.geometry.voxel_edge_um) / 1e6;
     if (!met || met.point.distanceTo(flight.place) <= Math.max(nearM, met.edgeM)) this.flight = null;
-    else this.go(flight);
+    else this.stage.flyOn(this.view(flight));
   }
 
   private async act(act: Act, id: string): Promise<void> {

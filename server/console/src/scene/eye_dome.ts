@@ -121,14 +121,13 @@ export class EyeDome {
     renderer.setRenderTarget(this.target);
     renderer.clear();
     renderer.render(voxels, camera);
-    renderer.autoClear = false;
     if (uShading.value === QUARTER) {
       renderer.setRenderTarget(this.lights);
       renderer.render(this.light.scene, this.flat);
     }
     renderer.setRenderTarget(null);
-    renderer.clear();
     renderer.render(this.screen.scene, this.flat);
+    renderer.autoClear = false;
     renderer.render(overlays, camera);
     renderer.autoClear = true;
   }

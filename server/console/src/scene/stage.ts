@@ -154,6 +154,11 @@ export class Stage {
   /** Bring the eye somewhere, so that people see how they got there. */
   fly(to: CameraView): void {
     this.onFly();
+    this.flyOn(to);
+  }
+
+  /** Bring it on from there: no flight of its own for those who go back. */
+  flyOn(to: CameraView): void {
     if (matchMedia("(prefers-reduced-motion: reduce)").matches || this.isSoftware) return this.place(to);
     this.flight = { from: this.view, to, startMs: performance.now() };
     this.draw();
