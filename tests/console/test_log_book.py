@@ -152,7 +152,7 @@ def test_entries_that_a_restored_server_lost_are_shown_no_more(console: Console)
         "((e) => (c.book.add([e]), c.strip.add([e])))({ ...c.strip.entries.get(c.cells.head), seq: a[0] })", lost
     )
     assert console.tell("[c.book.known.has(a[0]), c.strip.entries.has(a[0])]", lost) == [True, True]
-    console.tell("c.heard({ type: 'hello', resumed: false, cursor: 'of another log', robots: [] })")
+    console.tell("c.feed.heard({ type: 'hello', resumed: false, cursor: 'of another log', robots: [] })")
     console.until(f"!c.book.known.has({lost}) && !c.strip.entries.has({lost})", "the log that was known is forgotten")
     console.until(f"c.book.known.size === {LOG} && c.strip.entries.size && !c.book.isReading", "and read again")
 

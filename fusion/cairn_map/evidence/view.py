@@ -4,8 +4,10 @@ A view is for display, exports and robots that only drive; it is never merged. E
 step. At a depth above the voxels, a node has
 
     probability   the highest of the known voxels below: obstacles never vanish
-    colour        the mean of all samples below
+    colour        the mean of all samples below; without a colour camera that of the class with the most votes below
     temperature   the mean of all samples below, and that of the hottest voxel below
+
+A page gets a level's heights in the place of temperatures.
 """
 
 from dataclasses import dataclass
@@ -16,12 +18,17 @@ import numpy.typing as npt
 
 from cairn_map.arrays import Floats, Ints
 from cairn_map.errors import BadInputError
-from cairn_map.evidence.channels import Channel, ChannelKind, class_colours
+from cairn_map.evidence.channels import HEIGHT_OFFSET, OTHER_GREY, Channel, ChannelKind, class_colours
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.inverse_sensor_model import LOG_ODDS_STEP, SensorModel, log_odds
 from cairn_map.evidence.voxels import reading_of_sums
+from cairn_map.kernels.morton_kernels import deinterleave
 
+PALE_PARTS = 2
+"""Parts of grey in the colour of a class that leads by less than two votes, next to one of its own."""
+HEIGHT_RESOLUTION_M = 0.001
+"""Usual step of a level's heights in a view for a page, metres."""
 LOG_ODDS_ZERO = 1 << 15
 """Added to log-odds in steps, so that they are 16 bits without a sign."""
 
@@ -65,7 +72,10 @@ class ViewStyle:
     chance: Chance = Chance.BYTE
     colours: Colours = Colours.RGB_888
     temperature_step_k: float | None = 0.1
-    """Step of temperatures, kelvin; None: no temperatures."""
+    """Step of temperatures, kelvin; None: no temperatures. Of a level's view for a page: of heights, metres."""
+    is_for_page: bool = False
+    """True if a level has heights in place of temperatures, and classes that lead by less than two votes are paler. It
+    is not written: who reads a view knows its map."""
 
     def __post_init__(self) -> None:
         step = self.temperature_step_k
@@ -94,7 +104,8 @@ class View:
     warm: Ints
     """(W,) rows of `nodes` that have a temperature, rising."""
     temperatures: Ints
-    """(W, 1) means in steps, at the voxels' depth; else (W, 2) means and hottest voxels; (0, 0) without."""
+    """(W, 1) means in steps, at the voxels' depth; else (W, 2) means and hottest voxels; (0, 0) without. For a page
+    that shows a level the heights of surfaces over the node's lower face, means and highest, metres."""
 
     def __len__(self) -> int:
         return len(self.nodes)
@@ -132,15 +143,15 @@ def view_of(evidence: Evidence, geometry: Geometry, model: SensorModel, style: V
     depth = geometry.depth if style.depth is None else style.depth
     if not 1 <= depth <= geometry.depth:
         raise BadInputError("bad_style", f"a view's depth must be 1 to {geometry.depth}, got {depth}")
-    nodes, highest = _nodes(evidence, model, style.extent, up=3 * (geometry.depth - depth))
+    up = geometry.depth - depth
+    nodes, highest = _nodes(evidence, model, style.extent, up=3 * up)
     if style.chance is Chance.BYTE:
         chances = np.rint(255 / (1 + np.exp(-highest)))
     else:
         chances = np.rint(highest / LOG_ODDS_STEP) + LOG_ODDS_ZERO
     # The row of each sample's node; then the means of colours and temperatures by node.
-    rows = _rows_of(evidence.voxels[evidence.sampled] >> np.uint32(3 * (geometry.depth - depth)), nodes)
+    rows = _rows_of(evidence.voxels[evidence.sampled] >> np.uint32(3 * up), nodes)
     colour = next((c for c in geometry.channels if c.kind is ChannelKind.COLOUR), None)
-    thermal = next((c for c in geometry.channels if c.kind is ChannelKind.TEMPERATURE), None)
     named = next((c for c in geometry.channels if c.kind is ChannelKind.CLASSES), None)
     coloured, rgb = np.empty(0, np.int64), np.empty((0, len(TOPS[style.colours])), np.int64)
     if colour is not None and style.colours is not Colours.NONE:
@@ -149,10 +160,10 @@ def view_of(evidence: Evidence, geometry: Geometry, model: SensorModel, style: V
         coloured, rgb = _class_colours(evidence.samples[:, geometry.planes_of(named.name)], named, rows, style)
     columns = 0 if style.temperature_step_k is None else 1 if depth == geometry.depth else 2
     warm, temperatures = np.empty(0, np.int64), np.empty((0, columns), np.int64)
-    if thermal is not None and style.temperature_step_k is not None:
-        sums = evidence.samples[:, geometry.planes_of(thermal.name)]
-        warm, kelvin = _temperatures(sums, thermal, rows)
-        temperatures = np.rint(np.maximum(kelvin[:, :columns], 0) / style.temperature_step_k).astype(np.int64)
+    if style.temperature_step_k is not None:
+        has_heights = geometry.is_flat and style.is_for_page
+        warm, values = (_heights if has_heights else _kelvins)(evidence, geometry, rows, up)
+        temperatures = np.rint(np.maximum(values[:, :columns], 0) / style.temperature_step_k).astype(np.int64)
     return View(depth, style, nodes, chances.astype(np.int64), coloured, rgb, warm, temperatures)
 
 
@@ -187,20 +198,39 @@ def _class_colours(sums: Ints, channel: Channel, rows_of_samples: Ints, style: V
     rows, starts, mine = _by_node(sums, rows_of_samples)
     if not len(rows):
         return rows, np.empty((0, 3), np.int64)
-    numbers = reading_of_sums(channel, np.add.reduceat(mine, starts, axis=0)).mean.astype(np.int64)
-    rgb = class_colours(len(channel.classes))[numbers].astype(np.float64)
+    reading = reading_of_sums(channel, np.add.reduceat(mine, starts, axis=0))
+    rgb = class_colours(len(channel.classes))[reading.mean.astype(np.int64)].astype(np.float64)
+    if style.is_for_page and reading.unsure is not None:
+        rgb[reading.unsure] = (rgb[reading.unsure] + PALE_PARTS * OTHER_GREY) / (1 + PALE_PARTS)
     return rows, np.rint(rgb * np.array(TOPS[style.colours]) / 255).astype(np.int64)
 
 
-def _temperatures(sums: Ints, channel: Channel, rows_of_samples: Ints) -> tuple[Ints, Floats]:
+def _kelvins(evidence: Evidence, geometry: Geometry, rows_of_samples: Ints, _up: int) -> tuple[Ints, Floats]:
     """Rows of nodes with temperatures, and (W, 2) their means and hottest voxels, kelvin."""
+    thermal = next((c for c in geometry.channels if c.kind is ChannelKind.TEMPERATURE), None)
+    if thermal is None:
+        return np.empty(0, np.int64), np.empty((0, 2))
+    rows, means = _means(evidence.samples[:, geometry.planes_of(thermal.name)], rows_of_samples)
+    return rows, means * thermal.step + thermal.zero
+
+
+def _heights(evidence: Evidence, geometry: Geometry, rows_of_samples: Ints, up: int) -> tuple[Ints, Floats]:
+    """Rows of a level's nodes with surfaces, and (W, 2) mean and highest heights over the node's lower face, m."""
+    sums = evidence.samples[:, geometry.planes_of(HEIGHT_OFFSET.name)]
+    bins = deinterleave(evidence.voxels[evidence.sampled].astype(np.uint64))[:, 2] & ((1 << up) - 1)
+    sums_um = sums[:, 0] * round(HEIGHT_OFFSET.step * 1000) + bins * geometry.voxel_height_um * sums[:, -1]
+    rows, means = _means(np.stack([sums_um, sums[:, -1]], axis=1), rows_of_samples)
+    return rows, means / 1e6
+
+
+def _means(sums: Ints, rows_of_samples: Ints) -> tuple[Ints, Floats]:
+    """Rows of nodes with values, and (W, 2) their means and their highest voxels' means, as sums have them."""
     rows, starts, mine = _by_node(sums, rows_of_samples)
     if not len(rows):
         return rows, np.empty((0, 2))
     totals = np.add.reduceat(mine, starts, axis=0)
-    hottest = np.maximum.reduceat(mine[:, 0] / mine[:, -1], starts)
-    means = np.stack([totals[:, 0] / totals[:, -1], hottest], axis=1)
-    return rows, means * channel.step + channel.zero
+    highest = np.maximum.reduceat(mine[:, 0] / mine[:, -1], starts)
+    return rows, np.stack([totals[:, 0] / totals[:, -1], highest], axis=1)
 
 
 def _rows_of(sampled: npt.NDArray[np.uint32], nodes: npt.NDArray[np.uint32]) -> Ints:

@@ -24,8 +24,9 @@ from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.fingerprint import Fingerprint, fingerprint
 from cairn_map.evidence.grid import CellKey, Geometry, cell_of_key
 from cairn_map.evidence.inverse_sensor_model import SensorModel
-from cairn_map.evidence.view import FULL_STYLE, Extent, ViewStyle
+from cairn_map.evidence.view import FULL_STYLE, HEIGHT_RESOLUTION_M, Extent, ViewStyle
 from cairn_map.files.cell_files import CELL_MEDIA_TYPE, MEDIA_TYPES, cell_file
+from cairn_map.queries.level.shown_surfaces import shown_surfaces
 from cairn_server.cell_room import DECODING
 from cairn_server.folding.cells import Cells
 from cairn_server.folding.cells_at_rest import stored_history
@@ -49,6 +50,8 @@ FILE_VOXELS_MAX = 1 << 20
 """Known voxels of a cell that is made into an NPZ or PLY file: some 330 bytes of memory each."""
 TOTAL = "total"
 """Form of a cell of a map with epochs: the sum of its rows, as a cell of version 1."""
+LOOKS = 2
+"""Number of the way in which views for a page are made: another one makes all their ETags others."""
 BUNDLE_MEDIA_TYPE = "application/vnd.cairn.views"
 BUNDLE_CELLS_MAX = 10_000
 BUNDLE_BYTES_MAX = 8 << 20
@@ -68,11 +71,9 @@ class CellForm:
     """True for a view of all known nodes, with log-odds: a robot shows it while the rows are on their way."""
 
     @property
-    def style(self) -> ViewStyle:
-        """Style of a view in this form."""
-        if self.is_known:
-            return replace(FULL_STYLE, depth=self.depth, extent=Extent.KNOWN)
-        return ViewStyle(depth=self.depth)
+    def known_style(self) -> ViewStyle:
+        """Style of a view of all known nodes."""
+        return replace(FULL_STYLE, depth=self.depth, extent=Extent.KNOWN)
 
     @property
     def media_type(self) -> str:
@@ -97,7 +98,7 @@ def style_digest(row: MapRow) -> str:
 
 @lru_cache(maxsize=256)
 def _style_digest(geometry: Geometry, model: SensorModel) -> str:
-    text = f"{VERSION} {geometry.model_dump_json()} {model.model_dump_json()}"
+    text = f"{VERSION}.{LOOKS} {geometry.model_dump_json()} {model.model_dump_json()}"
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
@@ -140,8 +141,12 @@ def shown_reading(row: MapRow, stored: CellRow) -> Evidence:
 
 
 def view_of_reading(row: MapRow, stored: CellRow, evidence: Evidence, depth: int) -> bytes:
-    """View of what was read of a stored cell, at an octree depth."""
-    return encode_view(stored.key, evidence, row.geometry, row.sensor_model, style=ViewStyle(depth=depth))
+    """View for a page of what was read of a stored cell, at an octree depth."""
+    style = ViewStyle(depth, is_for_page=True)
+    if row.geometry.is_flat:
+        evidence = shown_surfaces(evidence, row.geometry, row.sensor_model)
+        style = replace(style, temperature_step_k=HEIGHT_RESOLUTION_M)
+    return encode_view(stored.key, evidence, row.geometry, row.sensor_model, style=style)
 
 
 class ViewCache:
@@ -297,7 +302,7 @@ class CellViews:
         with DECODING.of_cell(row.geometry, stored.voxels):
             evidence = reading_at(self._store, stored, row, form.at_s)
             if form.is_known:
-                return encode_view(stored.key, evidence, row.geometry, row.sensor_model, style=form.style)
+                return encode_view(stored.key, evidence, row.geometry, row.sensor_model, style=form.known_style)
             _check_file(form, len(evidence))
             return cell_file(form.suffix, stored.key, evidence, row.geometry, row.sensor_model)[0]
 
@@ -309,8 +314,7 @@ class CellViews:
 
         def make() -> bytes:
             with DECODING.of_cell(row.geometry, stored.voxels):
-                evidence = reading_at(self._store, stored, row, until_s)
-                return encode_view(stored.key, evidence, row.geometry, row.sensor_model, style=form.style)
+                return view_of_reading(row, stored, reading_at(self._store, stored, row, until_s), depth)
 
         return self.cache.view(f"{name}/{moment_name(row, until_s)}", make)
 

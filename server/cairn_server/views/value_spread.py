@@ -106,7 +106,7 @@ class ValueSpread:
             cursor=cursor,
             complete=is_complete,
             cells=len(found),
-            height=_heights(found, row.geometry.voxel_edge_m),
+            height=_heights(found, row.geometry.voxel_height_m),
             temperature=None if channel is None else _temperatures(found, channel.unit),
         )
 
@@ -152,14 +152,14 @@ def _temperature(row: MapRow) -> Channel | None:
     return next((each for each in row.geometry.channels if each.kind is ChannelKind.TEMPERATURE), None)
 
 
-def _heights(found: Sequence[CellSpread], edge_m: float) -> Spread | None:
+def _heights(found: Sequence[CellSpread], height_m: float) -> Spread | None:
     bins = [spread.layers for spread in found if len(spread.layers)]
     if not bins:
         return None
     least = min(int(each[0, 0]) for each in bins)
     most = max(int(each[-1, 0]) for each in bins)
-    ends_m = (least + 0.5) * edge_m, (most + 0.5) * edge_m
-    return _spread("m", ends_m, bins, edge_m)
+    ends_m = (least + 0.5) * height_m, (most + 0.5) * height_m
+    return _spread("m", ends_m, bins, height_m)
 
 
 def _temperatures(found: Sequence[CellSpread], unit: str) -> Spread | None:

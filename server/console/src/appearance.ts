@@ -2,7 +2,8 @@
 
 import { ageUnit, type LogBook } from "./log_book.ts";
 import { FIELDS, type Look } from "./look.ts";
-import type { Triple } from "./messages.ts";
+import { classesOf } from "./map_layers.ts";
+import type { MapInfo, Triple } from "./messages.ts";
 import { textureOf, type Palette } from "./palettes.ts";
 import type { Cells } from "./scene/cells.ts";
 import { boxes, FIELD_CODES, squares, uniforms } from "./scene/materials.ts";
@@ -23,11 +24,15 @@ export class Appearance {
   private readonly cells: Cells;
   private readonly book: LogBook;
   private readonly spread: Spread;
+  /** Names of the classes that colours stand for; none: colours are those of cameras. */
+  private readonly classes: readonly string[];
   /** Height that is told as 0, m in the map. */
   zeroM = 0;
   private readonly palettes = new Map<Palette, ReturnType<typeof textureOf>>();
 
-  constructor(look: Look, stage: Stage, cells: Cells, book: LogBook, spread: Spread) {
+  constructor(info: MapInfo, look: Look, stage: Stage, cells: Cells, book: LogBook, spread: Spread) {
+    this.classes = classesOf(info.geometry.channels);
+    uniforms.uLevelM.value = cells.isLevel ? cells.sizeAt(cells.depthMax).z : 0;
     this.look = look;
     this.stage = stage;
     this.cells = cells;
@@ -66,7 +71,7 @@ export class Appearance {
     const range = look.ranges[look.field] ?? (found && (found.map((end) => end - zero) as [number, number]));
     const before = uRange.value.toArray();
     if (range) uRange.value.set(range[0] + zero, range[1] + zero);
-    this.legend.show(look, range, robots, this.told(range), this.valuesOf(zero));
+    this.legend.show(look, range, { robots, classes: this.classes }, this.told(range), this.valuesOf(zero));
     // A frame takes the time of many ticks where there is no graphics card.
     if (look.field === "age" || look.field === "robot" || uRange.value.toArray().some((end, n) => end !== before[n])) this.stage.draw();
   }
@@ -96,7 +101,11 @@ export class Appearance {
   get planInk(): PlanInk {
     const locked = this.look.ranges.temperature;
     const rangeK = locked ? (locked.map((end) => end + KELVIN_ZERO_C) as [number, number]) : this.spread.range("temperature");
-    return { theme: document.documentElement.dataset.theme === "light" ? "light" : "dark", field: this.look.field, rangeK };
+    // A level's plan tells what hinders a vehicle, by whatever its picture is coloured.
+    const isOfGround = this.look.field === "slope" || this.look.field === "step";
+    const field = this.cells.isLevel && !isOfGround ? "difficulty" : this.look.field;
+    const range = this.look.ranges[field] ?? rangeOf(this.cells, field, -FAR_M, FAR_M) ?? [0, 1];
+    return { theme: document.documentElement.dataset.theme === "light" ? "light" : "dark", field, rangeK, range: this.cells.isLevel ? range : [0, 1] };
   }
 
   /** Dark or light, as the page is. */

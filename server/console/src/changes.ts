@@ -27,14 +27,14 @@ export function centresOf(changes: Changes, way: Way): Triple[] {
   return changes[way].flatMap(({ centres_m }) => centres_m);
 }
 
-/** The largest first. */
-export function thingsOf(changes: Changes, edgeM: number): ChangedThing[] {
-  return WAYS.flatMap((way) => pieces(centresOf(changes, way), edgeM).map((centres) => thing(way, centres, edgeM))).sort((a, b) => b.voxels - a.voxels);
+/** The largest first; `size`: of a voxel, m. */
+export function thingsOf(changes: Changes, size: Triple): ChangedThing[] {
+  return WAYS.flatMap((way) => pieces(centresOf(changes, way), size).map((centres) => thing(way, centres, size))).sort((a, b) => b.voxels - a.voxels);
 }
 
-function thing(way: Way, centres: readonly Triple[], edgeM: number): ChangedThing {
+function thing(way: Way, centres: readonly Triple[], size: Triple): ChangedThing {
   const end = (pick: (...values: number[]) => number, sign: number) =>
-    [0, 1, 2].map((axis) => centres.reduce((best, centre) => pick(best, centre[axis]!), -sign * Infinity) + (sign * edgeM) / 2) as Triple;
+    [0, 1, 2].map((axis) => centres.reduce((best, centre) => pick(best, centre[axis]!), -sign * Infinity) + (sign * size[axis]!) / 2) as Triple;
   const [lowM, highM] = [end(Math.min, -1), end(Math.max, 1)];
   const middle = lowM.map((low, axis) => (low + highM[axis]!) / 2);
   const awayM = (centre: Triple) => Math.hypot(...centre.map((value, axis) => value - middle[axis]!));
@@ -43,8 +43,8 @@ function thing(way: Way, centres: readonly Triple[], edgeM: number): ChangedThin
 }
 
 /** Connected pieces of voxels. */
-function pieces(centres: readonly Triple[], edgeM: number): Triple[][] {
-  const numberOf = (centre: readonly number[], step = [0, 0, 0]) => centre.map((value, axis) => Math.floor(value / edgeM) + step[axis]!).join();
+function pieces(centres: readonly Triple[], size: Triple): Triple[][] {
+  const numberOf = (centre: readonly number[], step = [0, 0, 0]) => centre.map((value, axis) => Math.floor(value / size[axis]!) + step[axis]!).join();
   const left = new Map(centres.map((centre) => [numberOf(centre), centre]));
   const steps = Array.from({ length: 27 }, (_, n) => [(n % 3) - 1, (Math.floor(n / 3) % 3) - 1, Math.floor(n / 9) - 1]);
   const found: Triple[][] = [];

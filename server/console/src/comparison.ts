@@ -4,6 +4,7 @@ import { Vector3 } from "three";
 import { ApiError, type Api } from "./api.ts";
 import { centresOf, thingsOf, WAYS, type ChangedThing, type Changes, type Way } from "./changes.ts";
 import type { Look } from "./look.ts";
+import { voxelSizeOf } from "./map_layers.ts";
 import type { MapInfo } from "./messages.ts";
 import type { Cells } from "./scene/cells.ts";
 import { ChangedVoxels } from "./scene/changed_voxels.ts";
@@ -47,7 +48,7 @@ export class Comparison {
     this.look = look;
     this.stage = stage;
     this.cells = cells;
-    this.voxels = new ChangedVoxels(info.geometry.voxel_edge_um / 1e6);
+    this.voxels = new ChangedVoxels(voxelSizeOf(info.geometry));
     this.stage.add(this.voxels.group);
     this.panel.onFly = (thing) => this.onFly(visibleFrom(this.cells, placeToSee(thing), this.stage.camera.position));
     this.panel.onWay = (way) => {
@@ -109,7 +110,7 @@ export class Comparison {
       if (this.isOld) this.drawn = ""; // the list takes the place of words also where it is the same
       this.isPending = this.isOld = false;
       this.changes = changes;
-      this.things = thingsOf(changes, this.info.geometry.voxel_edge_um / 1e6);
+      this.things = thingsOf(changes, voxelSizeOf(this.info.geometry));
       this.draw();
     } catch (error) {
       if (turn !== this.turn) return;

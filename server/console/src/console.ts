@@ -1,7 +1,7 @@
 /** One map on the page: the picture, the panels around it, and what flows between them. */
 
 import { Vector3 } from "three";
-import { NONE_READY, type Api } from "./api.ts";
+import type { Api } from "./api.ts";
 import { Appearance } from "./appearance.ts";
 import { h } from "./dom.ts";
 import { Duties } from "./duties.ts";
@@ -10,22 +10,22 @@ import { Heights } from "./heights.ts";
 import { KeptAddress } from "./kept_address.ts";
 import { LogBook } from "./log_book.ts";
 import { NewsBook, type NewsItem } from "./news.ts";
-import { LiveLink, type LinkState } from "./live.ts";
-import { toHash, type CameraView, type Field, type Look } from "./look.ts";
-import type { LiveEvent, MapInfo, Triple } from "./messages.ts";
+import { fieldsOf, toHash, type CameraView, type Field, type Look } from "./look.ts";
+import { MapFeed } from "./map_feed.ts";
+import type { MapInfo, Triple } from "./messages.ts";
 import { rgbOf, robotColour } from "./palettes.ts";
 import { Cells } from "./scene/cells.ts";
+import { Ground } from "./scene/ground.ts";
 import { CellGrid, Outline } from "./scene/lines.ts";
 import { Picker } from "./scene/picking.ts";
 import { Spread } from "./scene/spread.ts";
 import { Stage } from "./scene/stage.ts";
 import { Walker } from "./scene/walker.ts";
-import { serverNowS } from "./server_time.ts";
 import { Team } from "./team.ts";
 import { TimeDesk } from "./time_desk.ts";
 import { CameraPanel } from "./ui/camera_panel.ts";
 import { Chips } from "./ui/chips.ts";
-import { SHOWN, type CommitStrip } from "./ui/commit_strip.ts";
+import type { CommitStrip } from "./ui/commit_strip.ts";
 import { emptyMap } from "./ui/dead_ends.ts";
 import { openAsking, openFull } from "./ui/duty_dialogs.ts";
 import { DutyPanel } from "./ui/duty_panel.ts";
@@ -48,14 +48,13 @@ const WALKING = "Walking: W A S D go, drag or arrows look around, Escape ends";
 const TICK_MS = 250;
 /** A double click brings the eye so near, m, or to a third of the way. */
 const NEAR_M = 1.5;
-const AGAIN_MS = 3000;
 
 export class Console {
   readonly element: HTMLElement;
   readonly stage: Stage;
   readonly cells: Cells;
   readonly picker: Picker;
-  readonly link: LiveLink;
+  readonly feed: MapFeed;
   readonly team: Team;
   readonly book: LogBook;
   readonly duties: Duties;
@@ -68,6 +67,7 @@ export class Console {
   readonly appearance: Appearance;
   readonly spread: Spread;
   readonly heights: Heights;
+  readonly ground: Ground;
   private readonly api: Api;
   private readonly info: MapInfo;
   private readonly look: Look;
@@ -89,16 +89,9 @@ export class Console {
   private readonly empty: HTMLElement;
   private readonly frame: ReferenceFrame;
   private readonly flag = h("span", { class: "flag", role: "status" });
-  private state: LinkState = { live: false, heardMs: null };
   private moved = true;
   private logged = false;
-  private isAsking = false;
-  private loading: Promise<void>;
   private readonly kept = new KeptAddress(() => this.address);
-  /** State that the index was last taken from. */
-  private cursor = "";
-  /** When to load again what could not be loaded, as of performance.now(). */
-  private againAtMs = Infinity;
   private readonly timer: number;
 
   constructor(api: Api, info: MapInfo, look: Look, camera: CameraView | null, bar: TopBar, onRefused: () => void) {
@@ -106,10 +99,11 @@ export class Console {
     this.info = info;
     this.look = look;
     this.bar = bar;
+    this.check();
     const host = h("div", { class: "host" });
     this.book = new LogBook(api, info.name);
     this.duties = new Duties(api, info.name);
-    this.voxel = new VoxelPanel(api, info.name, look, (seq) => this.book.robotAt(seq));
+    this.voxel = new VoxelPanel(api, info, look, (seq) => this.book.robotAt(seq));
     this.takeAway = new TakeAwayPanel(api, info, look);
     this.panel = new LookPanel(look);
     this.cells = new Cells(api, info);
@@ -137,6 +131,8 @@ export class Console {
     view.append(this.time.comparison.panel.element);
     this.spread = new Spread(api, info.name);
     this.heights = new Heights(look, this.cells, this.spread);
+    this.ground = new Ground(this.cells);
+    this.ground.onChange = () => this.stage.draw();
     this.team = new Team(api, info.name, this.labels, this.stage, this.cells);
     view.append(h("div", { class: "through" }, this.team.picture.element, this.team.fromPose.element));
     this.picker = new Picker(this.stage, this.cells);
@@ -155,7 +151,7 @@ export class Console {
     this.stage.add(this.findings.pins.group);
     view.append(this.findings.pins.element, this.findings.alarm.banner);
     left.append(this.dutyPanel.element, this.findings.panel.element, this.newsPanel.element, this.camera.element, this.team.panel.element, mapFacts(info));
-    this.appearance = new Appearance(look, this.stage, this.cells, this.book, this.spread);
+    this.appearance = new Appearance(info, look, this.stage, this.cells, this.book, this.spread);
     view.append(this.appearance.legend.element);
     this.plan = new PlanPanel(this.stage, this.cells, this.heights, {
       ink: () => this.appearance.planInk, findings: () => this.findings.all, robots: () => this.team.places,
@@ -163,12 +159,17 @@ export class Console {
     });
     view.append(this.plan.small, this.plan.element);
     this.connect(onRefused);
-    this.loading = Promise.resolve();
-    this.link = new LiveLink(api, info.name, (event) => this.heard(event), (state) => (this.state = state), onRefused);
+    this.feed = new MapFeed(api, info, { cells: this.cells, book: this.book, strip: this.strip, team: this.team, findings: this.findings, news: this.news }, {
+      plan: () => this.replan(), refuse: onRefused,
+      show: () => {
+        this.moved = true;
+        this.tick();
+      },
+    });
     this.timer = window.setInterval(() => this.tick(), TICK_MS);
     this.theme();
     this.apply();
-    this.loading = this.reload();
+    this.feed.begin();
     void this.prepare();
   }
 
@@ -192,6 +193,7 @@ export class Console {
   /** Show what another address of this map says: a link, or Back. */
   take(look: Look, camera: CameraView | null): void {
     Object.assign(this.look, look, { boxes: look.boxes ?? this.look.boxes });
+    this.check();
     this.heights.forget();
     this.time.follow();
     this.team.follow(null);
@@ -211,7 +213,7 @@ export class Console {
 
   dispose(): void {
     window.clearInterval(this.timer);
-    this.link.close();
+    this.feed.close();
     this.cells.dispose();
     this.shelf.dispose();
     this.findings.dispose();
@@ -224,8 +226,15 @@ export class Console {
   }
 
   setField(field: Field): void {
+    if (!fieldsOf(this.info.geometry).some((one) => one.field === field)) return;
     this.look.field = field;
     this.apply();
+  }
+
+  /** A field that this map does not have gives way to the one that it is opened with. */
+  private check(): void {
+    const fields = fieldsOf(this.info.geometry);
+    if (!fields.some(({ field }) => field === this.look.field)) this.look.field = fields[0]!.field;
   }
 
   step(up: boolean): void {
@@ -267,7 +276,7 @@ export class Console {
     this.takeAway.choose(picked?.cell.key ?? null);
     if (!picked) return this.askNothing();
     this.shelf.open("voxel");
-    void this.voxel.show(picked, this.cells.depthMax, this.heights.floorM);
+    void this.voxel.show(picked, this, this.heights.floorM);
   }
 
   private askNothing(): void {
@@ -399,99 +408,31 @@ export class Console {
     };
   }
 
-  private heard(event: LiveEvent): void {
-    this.findings.hear(event);
-    this.news.hear(event);
-    if (event.type === "hello") {
-      this.team.greet(event.robots);
-      if (!event.resumed) void this.loading.then(() => (this.cursor === event.cursor ? undefined : this.reloadAll()));
-    } else if (event.type === "cells") {
-      if (event.cells === "many") void this.reload();
-      else {
-        for (const [i, j, k, lm] of event.cells) this.cells.changed([i, j, k], lm);
-        this.replan();
-      }
-    } else if (event.type === "log") {
-      // Events leave out when the server received them, which was just now.
-      const entries = event.entries.map((entry) => ({ ...entry, pushed_s: entry.pushed_s ?? serverNowS() }));
-      this.book.add(entries);
-      this.strip.add(entries);
-      if (event.left_out) void this.readLog(event.entries[event.entries.length - 1].seq, event.left_out + event.entries.length).catch(() => this.reload());
-      this.team.refresh();
-    } else if (event.type === "robot") {
-      this.team.hear(event.robot);
-    }
-  }
-
-  /** The same where the server cannot prove that its log is the one that is known here: a part of that may be lost. */
-  private reloadAll(): Promise<void> {
-    this.book.forget();
-    this.strip.forget();
-    return this.reload();
-  }
-
-  /** Everything anew: what the page has of it stays. */
-  private async reload(): Promise<void> {
-    try {
-      const { name } = this.info;
-      const isNew = this.cells.all.size === 0;
-      const [{ cursor, entries }, ready] = await Promise.all([
-        this.api.cells(name), isNew ? this.api.readyViews(name).catch(() => NONE_READY) : NONE_READY,
-      ]);
-      this.cursor = cursor;
-      this.cells.error = null;
-      this.cells.takeIndex(entries, ready);
-      this.moved = true;
-      this.tick();
-      this.team.refresh();
-      await this.readLog(Number(cursor.split(".")[1]), SHOWN);
-      await this.book.reachBack(entries.reduce((least, { lm, voxels }) => (voxels ? Math.min(least, lm) : least), Infinity));
-    } catch (error) {
-      this.cells.error = (error as Error).message;
-      this.againAtMs = performance.now() + AGAIN_MS;
-    }
-  }
-
-  private async readLog(head: number, count: number): Promise<void> {
-    this.strip.add(await this.book.newest(head, count));
-  }
-
-  /** Where evidence was taken out last, the log alone does not tell whose is left. */
-  private async askHeld(): Promise<void> {
-    if (this.isAsking || ![...this.cells.all.values()].some(({ lm, held }) => held?.lm !== lm && this.book.isOut(lm))) return;
-    this.isAsking = true;
-    // Without an answer they stay grey, and are asked for again with the next entry of the log.
-    await this.api.cells(this.info.name, "&held=true").then(({ entries }) => this.cells.takeHeld(entries), () => undefined);
-    this.isAsking = false;
-  }
-
   /** A few times a second: what has no event of its own. */
   private tick(): void {
     if (this.logged) {
       this.logged = false;
       this.moved = true;
       this.team.wereAt(this.book);
-      void this.askHeld();
+      void this.feed.askHeld();
     }
     if (this.moved || this.cells.needsPlan || this.cells.waiting) {
       this.moved = false;
       this.replan();
       this.appearance.refreshRange(this.team.names);
     }
-    if (this.cursor) this.spread.tick(this.cells.head);
+    if (this.feed.cursor) this.spread.tick(this.cells.head);
     // Of a past moment heights are told as of now: the picture stays comparable.
-    if (this.look.atS === null || !this.heights.storeys.floorsM.length) this.heights.tick();
+    if (!this.cells.isLevel && (this.look.atS === null || !this.heights.storeys.floorsM.length)) this.heights.tick();
+    this.ground.tick();
     this.camera.settle();
     this.kept.tick(this.camera.isPlaced && !this.stage.isFlying);
     const bounds = this.cells.tightBounds;
     if (!bounds.isEmpty()) this.panel.span(bounds.min.z, bounds.max.z);
     this.grid.lines.visible = this.look.cells;
     this.grid.update([...this.cells.all.values()].filter(({ points }) => points).map(({ box }) => box));
-    this.bar.showLink(this.state, this.cells.waiting, this.cells.error);
-    if (performance.now() >= this.againAtMs) {
-      this.againAtMs = Infinity;
-      void this.reload();
-    }
+    this.bar.showLink(this.feed.state, this.cells.waiting, this.cells.error);
+    this.feed.tick();
     this.duties.tick();
     this.findings.tick();
     this.measure.tick();
@@ -506,7 +447,7 @@ export class Console {
     const { lastSeq } = this.team;
     const missed = lastSeq === null ? [] : [...this.cells.all.values()].filter(({ points, lm }) => points && lm > lastSeq);
     this.unseen.update(missed.map(({ box }) => box));
-    this.empty.hidden = this.cursor === "" || this.cells.all.size > 0;
+    this.empty.hidden = this.feed.cursor === "" || this.cells.all.size > 0;
     this.labels.hidden = this.cells.firstPictureMs === null && this.cells.all.size > 0;
     this.chips.show(this.look, this.cells, this.heights.storeys, this.panel.zeroM, this.time.words);
     const drawn = `${thousands(this.cells.drawn)} nodes of ${this.cells.all.size} cells`;

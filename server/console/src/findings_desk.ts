@@ -80,7 +80,7 @@ export class FindingsDesk {
     this.panel = new FindingsPanel(overC, this.alarm.element, this.attachments);
     this.pins = new Pins(this.stage);
     this.marks = new MarkBook(api, info.name.split(".")[0]!); // marks are the map's, also where one of its layers is shown
-    this.spots = new HotSpotList(api, info.name, overC);
+    this.spots = new HotSpotList(api, info, overC);
     this.marks.onChange = this.spots.onChange = () => this.update();
     this.panel.onFly = this.pins.onChoose = this.alarm.onFly = (id) => this.fly(id);
     this.panel.onAct = (act, id) => void this.act(act, id);

@@ -1,7 +1,7 @@
 /** The map's hot spots as the server lists them: asked for when cells changed, and not while nothing does. */
 
 import { ApiError, type Api } from "./api.ts";
-import type { HotSpot, HotSpots } from "./messages.ts";
+import type { HotSpot, HotSpots, MapInfo } from "./messages.ts";
 import { KELVIN_ZERO_C } from "./units.ts";
 
 /** Spots of an answer: 10 kB. */
@@ -11,6 +11,7 @@ const TRIES = 100;
 /** Between two questions: robots that push together make one. */
 const PAUSE_MS = 1500;
 const AGAIN_MS = 5000;
+const COLD = "This map has no temperatures.";
 
 export class HotSpotList {
   onChange: () => void = () => {};
@@ -27,11 +28,15 @@ export class HotSpotList {
   private isAsking = false;
   private readonly api: Api;
   private readonly map: string;
+  /** The map has temperatures. */
+  private readonly isWarm: boolean;
 
-  constructor(api: Api, map: string, overC: number) {
+  constructor(api: Api, { name, geometry }: MapInfo, overC: number) {
     this.api = api;
-    this.map = map;
+    this.map = name;
     this.overC = overC;
+    this.isWarm = geometry.channels.some(({ kind }) => kind === "temperature");
+    if (!this.isWarm) this.said = COLD;
   }
 
   /** Ask soon; many callings make one question. */
@@ -49,7 +54,7 @@ export class HotSpotList {
 
   /** A few times a second. */
   tick(): void {
-    if (!this.isAsking && performance.now() >= this.askAtMs) void this.ask();
+    if (this.isWarm && !this.isAsking && performance.now() >= this.askAtMs) void this.ask();
   }
 
   private nextMs = 0;
@@ -84,7 +89,7 @@ export class HotSpotList {
       this.spots = [];
       this.total = 0;
       this.said =
-        kind === "unknown_channel" ? "This map has no temperatures."
+        kind === "unknown_channel" ? COLD
         : kind === "no_route" ? "This server is older than lists of hot spots."
         : "Too much of the map is that warm: give a higher temperature.";
       return;

@@ -1,9 +1,10 @@
 /** How the map is looked at: kept in the address, so that a link shows another person the same. */
 
-import type { Triple } from "./messages.ts";
+import { classesOf } from "./map_layers.ts";
+import type { Geometry, Triple } from "./messages.ts";
 import type { Palette } from "./palettes.ts";
 
-export type Field = "colour" | "temperature" | "probability" | "height" | "age" | "robot";
+export type Field = "colour" | "temperature" | "probability" | "height" | "age" | "robot" | "difficulty" | "slope" | "step";
 
 export const FIELDS: { field: Field; label: string; palette: Palette | null; unit: string }[] = [
   { field: "colour", label: "Colour", palette: null, unit: "" },
@@ -12,7 +13,21 @@ export const FIELDS: { field: Field; label: string; palette: Palette | null; uni
   { field: "height", label: "Height", palette: "viridis", unit: "m" },
   { field: "age", label: "Age", palette: "cividis", unit: "s" },
   { field: "robot", label: "Robot", palette: null, unit: "" },
+  { field: "difficulty", label: "Difficulty", palette: "viridis", unit: "" },
+  { field: "slope", label: "Slope", palette: "viridis", unit: "°" },
+  { field: "step", label: "Step", palette: "viridis", unit: "m" },
 ];
+
+/** Fields of levels alone, and what they lack. */
+const OF_GROUND: readonly Field[] = ["difficulty", "slope", "step"];
+const OF_SPACE: readonly Field[] = ["colour", "temperature"];
+
+/** Fields that a map may be coloured by, the first one as it is opened; what the colours of a map of classes mean is a class. */
+export function fieldsOf({ height_step_um, channels }: Geometry): typeof FIELDS {
+  if (height_step_um !== undefined) return [FIELDS.find(({ field }) => field === "height")!, ...FIELDS.filter(({ field }) => field !== "height" && !OF_SPACE.includes(field))];
+  const isOfClasses = classesOf(channels).length > 0;
+  return FIELDS.filter(({ field }) => !OF_GROUND.includes(field)).map((one) => (one.field === "colour" && isOfClasses ? { ...one, label: "Class" } : one));
+}
 
 export interface Look {
   field: Field;

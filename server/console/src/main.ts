@@ -41,8 +41,7 @@ async function start(why = ""): Promise<void> {
   open?.dispose();
   open = null;
   for (;;) {
-    // A level's voxels are flat, and would be drawn as cubes at wrong heights: `cairn map query MAP.LAYER elevation` draws it.
-    const maps = (await mapsOf(why)).filter(({ geometry }) => geometry.height_step_um === undefined);
+    const maps = await mapsOf(why);
     if (mine !== starts) return;
     const { map } = fromHash(location.hash);
     const info = map === null ? maps.toSorted((a, b) => b.size_bytes - a.size_bytes)[0] : maps.find(({ name }) => name === map);
@@ -63,7 +62,7 @@ function show(maps: MapInfo[], info: MapInfo): void {
     void start(why);
   };
   const goTo = (name: string) => (location.hash = `map=${name}`);
-  const bar = new TopBar(maps, info.name, api.token !== null, { map: goTo, keys: () => showKeys(keys), share, logOut: () => again("") });
+  const bar = new TopBar(maps, info, api.token !== null, { map: goTo, keys: () => showKeys(keys), share, logOut: () => again("") });
   document.body.append(bar.element);
   if (!hasWebGl()) return void document.body.append(new StillPictures(api, info).element);
   const mine = starts;

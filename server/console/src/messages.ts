@@ -6,13 +6,24 @@ export interface Channel {
   unit: string;
   step: number;
   zero: number;
+  /** Names of the classes that it counts, the last one `other`; of the kind `classes` alone. */
+  classes?: string[];
+}
+
+/** Grid of a map. */
+export interface Geometry {
+  voxel_edge_um: number;
+  depth: number;
+  channels: Channel[];
+  /** Height of a flat voxel: the map is a level. Left out: voxels are cubes. */
+  height_step_um?: number;
 }
 
 export type Triple = [number, number, number];
 
 export interface MapInfo {
   name: string;
-  geometry: { voxel_edge_um: number; depth: number; channels: Channel[]; height_step_um?: number };
+  geometry: Geometry;
   sensor_model: { p_hit: number; p_miss: number; p_min: number; p_max: number; p_occupied: number };
   cursor: string;
   cells: number;

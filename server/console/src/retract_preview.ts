@@ -1,6 +1,7 @@
 /** What a retract would change, in the map: what goes in red, before anything is taken out. */
 
 import type { Api } from "./api.ts";
+import { voxelSizeOf } from "./map_layers.ts";
 import type { MapInfo, RetractRequest, Triple } from "./messages.ts";
 import { ChangedVoxels } from "./scene/changed_voxels.ts";
 import type { Stage } from "./scene/stage.ts";
@@ -28,7 +29,7 @@ export class RetractPreview {
     this.api = api;
     this.map = info.name;
     this.stage = stage;
-    this.voxels = new ChangedVoxels(info.geometry.voxel_edge_um / 1e6);
+    this.voxels = new ChangedVoxels(voxelSizeOf(info.geometry));
     stage.add(this.voxels.group);
   }
 

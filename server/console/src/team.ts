@@ -136,7 +136,7 @@ export class Team {
     this.full = full;
     const followed = this.followed === null ? undefined : this.signs.get(this.followed);
     this.picture.show(this.followed, followed?.view_s ?? null);
-    this.fromPose.show(this.followed, followed?.status?.pose ?? null, field, head);
+    this.fromPose.show(this.followed, this.cells.isLevel ? null : (followed?.status?.pose ?? null), field, head);
     if (performance.now() >= this.askAtMs) {
       this.askAtMs = performance.now() + REFRESH_MS;
       void this.ask();

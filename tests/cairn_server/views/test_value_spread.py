@@ -10,7 +10,9 @@ from tests.fixtures.server.pushes import pushed
 
 from cairn_client.folders.map_folder import open_map
 from cairn_map.arrays import Floats
-from cairn_map.evidence.grid import cell_key
+from cairn_map.evidence.channels import HEIGHT_OFFSET
+from cairn_map.evidence.evidence import packed_evidence
+from cairn_map.evidence.grid import Geometry, cell_key
 from cairn_map.wire.spread_messages import BINS_MAX, Spread, SpreadAnswer
 from cairn_server.store.store_rows import MapRow
 from cairn_server.views import value_spread
@@ -100,3 +102,16 @@ def test_a_map_without_temperatures_has_heights_alone(live: Live) -> None:
     assert found.height is not None
     assert found.temperature is None
     assert (asked(live, empty).height, asked(live, empty).cells) == (None, 0)
+
+
+def test_heights_of_a_level_are_counted_by_its_bins(live: Live) -> None:
+    level = Geometry(voxel_edge_um=200_000, height_step_um=50_000, depth=3, channels=(HEIGHT_OFFSET,))
+    row = live.new_map(level)
+    evidence = packed_evidence(
+        np.array([0, 4], np.uint32), np.array([[4, 0], [4, 0]]), np.array([[8, 4], [12, 4]]), level
+    )
+    assert live.push(row, pushed(0, 0, geometry=level, cells={cell_key((0, 0, 1)): evidence})).status_code == 201
+    live.folded(row)
+    height = asked(live, row).height
+    assert height is not None
+    assert (height.begin, height.step, height.counts) == (pytest.approx(0.4), 0.05, [1, 1])

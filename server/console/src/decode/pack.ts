@@ -3,7 +3,10 @@
  *     u8 x, y, z in nodes of the cell | u8 probability in 1/255 | u8 red, green, blue | u8 flags | u16 mean, hottest
  *
  * Flags: bit 0 it has a colour, bit 1 a temperature, bits 2 to 7 its faces towards -x, +x, -y, +y, -z, +z lie open: that
- * is enough to light it. Temperatures are in steps of 0.02 K from 150 K on: 1460 K at most. What has none says so in its flags. */
+ * is enough to light it. Temperatures are in steps of 0.02 K from 150 K on: 1460 K at most. What has none says so in its flags.
+ *
+ * A level's nodes have instead of the colour what scene/ground.ts finds of their neighbours (bit 0: it did), and instead of the
+ * temperature the height of the surface over the node's lower face in mm, plus 1 (0: none, it is an obstacle), and a fall. */
 
 import type { View } from "./view.ts";
 
@@ -12,6 +15,11 @@ export const COLOURED = 1;
 export const WARM = 2;
 export const HEAT_STEP_K = 0.02;
 export const HEAT_ZERO_K = 150;
+/** Of a level's nodes, one byte each: steps of difficulty, slope in degrees and step in m; and the slope that is not known. */
+export const DIFFICULTY_STEP = 0.01;
+export const SLOPE_STEP_DEG = 0.25;
+export const RISE_STEP_M = 0.004;
+export const NO_SLOPE = 255;
 
 /** 16 places along one axis from the lowest, fourth, ... bits of a Morton number. */
 function squeezed(place: number): number {
@@ -22,7 +30,7 @@ function squeezed(place: number): number {
   return (x ^ (x >> 16)) & 0x3ff;
 }
 
-export function packed(view: View): Uint8Array {
+export function packed(view: View, isLevel = false): Uint8Array {
   const bytes = new Uint8Array(view.nodes.length * STRIDE);
   const words = new Uint16Array(bytes.buffer);
   for (let v = 0; v < view.nodes.length; v++) {
@@ -44,6 +52,10 @@ export function packed(view: View): Uint8Array {
   }
   for (let w = 0; w < view.warm.length; w++) {
     const row = view.warm[w];
+    if (isLevel) {
+      words[row * (STRIDE / 2) + 4] = Math.min(Math.round(view.heats[w * view.heatColumns] * view.heatStepK * 1000) + 1, 65535);
+      continue;
+    }
     bytes[row * STRIDE + 7] |= WARM;
     const mean = view.heats[w * view.heatColumns];
     const hottest = view.heats[w * view.heatColumns + view.heatColumns - 1];

@@ -9,10 +9,10 @@ export interface Decoded {
   readonly error?: string;
 }
 
-self.onmessage = (event: MessageEvent<{ id: number; data: Uint8Array }>) => {
-  const { id, data } = event.data;
+self.onmessage = (event: MessageEvent<{ id: number; data: Uint8Array; isLevel: boolean }>) => {
+  const { id, data, isLevel } = event.data;
   try {
-    const bytes = packed(decodeView(data));
+    const bytes = packed(decodeView(data), isLevel);
     self.postMessage({ id, bytes } satisfies Decoded, { transfer: [bytes.buffer] });
   } catch (error) {
     self.postMessage({ id, error: String(error) } satisfies Decoded);

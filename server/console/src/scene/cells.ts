@@ -1,6 +1,6 @@
 /** The map's cells as they are shown: what the server has, what lies on the graphics card, what is still to be fetched. */
 
-import { Box3, Group, type Camera, type PerspectiveCamera, type Points, type ShaderMaterial } from "three";
+import { Box3, Group, Vector3, type Camera, type PerspectiveCamera, type Points, type ShaderMaterial } from "three";
 import { ApiError, NONE_READY, type Api, type CellAnswer, type ReadyViews } from "../api.ts";
 import type { CellEntry, MapInfo, Triple } from "../messages.ts";
 import type { Moment } from "../timeline.ts";
@@ -19,8 +19,14 @@ export class Cells {
   readonly group = new Group();
   readonly all = new Map<string, ShownCell>();
   readonly byNumber: ShownCell[] = [];
+  /** Edge of a cell, and its height, m: that of a level's cells is less. */
   readonly edgeM: number;
+  readonly heightM: number;
   readonly depthMax: number;
+  /** The map is a level: a surface of flat voxels. */
+  readonly isLevel: boolean;
+  /** Number of the last change of what is drawn. */
+  shows = 0;
   /** Colour of the robot behind a log entry, 0 to 1; null: not known. */
   colourOf: (lm: number) => Triple | null = () => null;
   /** Age of what a log entry changed, and its unit: s, or log entries where no commit states a time. */
@@ -38,7 +44,7 @@ export class Cells {
   /** Numbers of cells that are gone. */
   private readonly free: number[] = [];
   private running = 0;
-  private readonly decoders = new Decoders();
+  private readonly decoders: Decoders;
   private readonly api: Api;
   private readonly map: string;
   private planned = false;
@@ -58,7 +64,11 @@ export class Cells {
     this.api = api;
     this.map = info.name;
     this.depthMax = info.geometry.depth;
-    this.edgeM = (info.geometry.voxel_edge_um * 2 ** this.depthMax) / 1e6;
+    const { voxel_edge_um, height_step_um } = info.geometry;
+    this.isLevel = height_step_um !== undefined;
+    this.edgeM = (voxel_edge_um * 2 ** this.depthMax) / 1e6;
+    this.heightM = ((height_step_um ?? voxel_edge_um) * 2 ** this.depthMax) / 1e6;
+    this.decoders = new Decoders(this.isLevel);
   }
 
   /** Take over the whole index: what differs from what is shown is taken from `ready` or fetched, what is gone goes. */
@@ -146,7 +156,8 @@ export class Cells {
     }
   }
 
-  private get momentKey(): string {
+  /** Key of the moment that is shown; empty: now. */
+  get momentKey(): string {
     return this.moment?.key ?? "";
   }
 
@@ -330,7 +341,13 @@ export class Cells {
     return samplePoints(this.material);
   }
 
+  /** Size of a node at a depth, m. */
+  sizeAt(depth: number): Vector3 {
+    return new Vector3(this.edgeM, this.edgeM, this.heightM).divideScalar(2 ** depth);
+  }
+
   private show(cell: ShownCell, bytes: Uint8Array, depth: number): void {
+    this.shows++;
     const points = cell.take(bytes, depth, this.material);
     if (!points) return;
     points.onBeforeRender = (_renderer, _scene, _camera: Camera, _geometry, material) => {
@@ -364,7 +381,7 @@ export class Cells {
     const key = cell.join(",");
     let shown = this.all.get(key);
     if (!shown) {
-      shown = new ShownCell(cell, this.edgeM, this.free.pop() ?? this.byNumber.length);
+      shown = new ShownCell(cell, this.edgeM, this.heightM, this.free.pop() ?? this.byNumber.length);
       this.byNumber[shown.number] = shown;
       this.all.set(key, shown);
     }

@@ -19,9 +19,10 @@ export class ChangedVoxels {
   readonly group = new Group();
   private readonly shape: BoxGeometry;
 
-  constructor(edgeM: number) {
-    const side = edgeM * GROWN;
-    this.shape = shaded(new BoxGeometry(side, side, side));
+  /** `size`: of a voxel, m. */
+  constructor(size: Triple) {
+    const [x, y, z] = size.map((edgeM) => edgeM * GROWN);
+    this.shape = shaded(new BoxGeometry(x, y, z));
   }
 
   /** `isShown`: whether a place lies within what is shown of the map. */

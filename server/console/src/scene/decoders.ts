@@ -8,8 +8,11 @@ export class Decoders {
   private readonly workers: Worker[];
   private readonly waiting = new Map<number, Waiting>();
   private next = 0;
+  private readonly isLevel: boolean;
 
-  constructor(count = Math.max(1, Math.min(3, (navigator.hardwareConcurrency || 2) - 1))) {
+  /** `isLevel`: views are of a level. */
+  constructor(isLevel: boolean, count = Math.max(1, Math.min(3, (navigator.hardwareConcurrency || 2) - 1))) {
+    this.isLevel = isLevel;
     this.workers = Array.from({ length: count }, () => {
       const worker = new Worker(new URL("../decode/worker.ts", import.meta.url), { type: "module" });
       worker.onmessage = (event: MessageEvent<Decoded>) => this.done(event.data);
@@ -21,7 +24,7 @@ export class Decoders {
     const id = this.next++;
     return new Promise((resolve, reject) => {
       this.waiting.set(id, { resolve, reject });
-      this.workers[id % this.workers.length].postMessage({ id, data }, [data.buffer]);
+      this.workers[id % this.workers.length].postMessage({ id, data, isLevel: this.isLevel }, [data.buffer]);
     });
   }
 

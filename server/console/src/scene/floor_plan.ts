@@ -76,16 +76,16 @@ export function floorPlanOf(cells: Cells, floorsM: readonly number[], storey: nu
     coloured: new Float32Array(count).fill(-Infinity),
   };
   const floorM = floorsM[storey] ?? null;
-  const voxelM = cells.edgeM / 2 ** cells.depthMax;
+  const voxelM = cells.heightM / 2 ** cells.depthMax;
   let coarseM = 0;
   for (const { bytes, depth, box, wanted, isEmpty } of drawn) {
-    const edgeM = cells.edgeM / 2 ** depth;
+    const [edgeM, tallM] = [cells.edgeM / 2 ** depth, cells.heightM / 2 ** depth];
     if (!bytes.length && wanted === 0 && !isEmpty) fillSquare(raster, box.min.x, box.min.y, cells.edgeM, (at) => (raster.kinds[at] ||= ABSENT));
     if (bytes.length && depth < cells.depthMax) coarseM = Math.max(coarseM, edgeM);
     for (let at = 0; at < bytes.length; at += STRIDE) {
-      const z = box.min.z + (bytes[at + 2] + 0.5) * edgeM;
-      if (!isWithin(z, edgeM, voxelM, [lowM, highM]) || bytes[at + 3] / 255 < uniforms.uMinP.value) continue;
-      const kind = kindOf(z, edgeM, voxelM, floorM);
+      const z = box.min.z + (bytes[at + 2] + 0.5) * tallM;
+      if (!isWithin(z, tallM, voxelM, [lowM, highM]) || bytes[at + 3] / 255 < uniforms.uMinP.value) continue;
+      const kind = kindOf(z, tallM, voxelM, floorM);
       const kelvin = bytes[at + 7] & WARM ? (bytes[at + 10] + 256 * bytes[at + 11]) * HEAT_STEP_K + HEAT_ZERO_K : 0;
       fillSquare(raster, box.min.x + bytes[at] * edgeM, box.min.y + bytes[at + 1] * edgeM, edgeM, (to) => {
         if (raster.kinds[to] === ABSENT || raster.kinds[to] < kind) raster.kinds[to] = kind;
@@ -99,7 +99,7 @@ export function floorPlanOf(cells: Cells, floorsM: readonly number[], storey: nu
   return cropped({ ...raster, lowM, highM, coarseM });
 }
 
-/** A voxel lies in a slab with its centre, a coarser node with any part of it: what it stands for may be there. */
+/** A voxel lies in a slab with its centre, a coarser node with any part of its height `edgeM`: what it stands for may be there. */
 export function isWithin(z: number, edgeM: number, voxelM: number, [lowM, highM]: readonly [number, number]): boolean {
   const reachM = (edgeM - voxelM) / 2;
   return z + reachM >= lowM && z - reachM <= highM;

@@ -16,13 +16,13 @@ export function freeM(cells: Cells, from: Vector3, to: Vector3): number {
   let free = from.distanceTo(to);
   for (const { bytes, depth, box } of cells.all.values()) {
     if (!bytes.length || !ray.intersectsBox(box)) continue;
-    const edgeM = cells.edgeM / 2 ** depth;
+    const size = cells.sizeAt(depth);
     for (let at = 0; at < bytes.length; at += STRIDE) {
       if (bytes[at + 3] / 255 < uMinP.value) continue;
-      centre.set(bytes[at] + 0.5, bytes[at + 1] + 0.5, bytes[at + 2] + 0.5).multiplyScalar(edgeM).add(box.min);
+      centre.set(bytes[at] + 0.5, bytes[at + 1] + 0.5, bytes[at + 2] + 0.5).multiply(size).add(box.min);
       if (!shown.containsPoint(centre)) continue;
-      node.min.copy(centre).subScalar(edgeM / 2);
-      node.max.copy(centre).addScalar(edgeM / 2);
+      node.min.copy(centre).addScaledVector(size, -0.5);
+      node.max.copy(centre).addScaledVector(size, 0.5);
       if (!node.containsPoint(from) && ray.intersectBox(node, met)) free = Math.min(free, met.distanceTo(from));
     }
   }
@@ -37,12 +37,12 @@ export function isFree(cells: Cells, body: Box3): boolean {
   const centre = new Vector3();
   for (const { bytes, depth, box } of cells.all.values()) {
     if (!bytes.length || !box.intersectsBox(body)) continue;
-    const edgeM = cells.edgeM / 2 ** depth;
+    const size = cells.sizeAt(depth);
     for (let at = 0; at < bytes.length; at += STRIDE) {
       if (bytes[at + 3] / 255 < uMinP.value) continue;
-      centre.set(bytes[at] + 0.5, bytes[at + 1] + 0.5, bytes[at + 2] + 0.5).multiplyScalar(edgeM).add(box.min);
-      node.min.copy(centre).subScalar(edgeM / 2);
-      node.max.copy(centre).addScalar(edgeM / 2);
+      centre.set(bytes[at] + 0.5, bytes[at + 1] + 0.5, bytes[at + 2] + 0.5).multiply(size).add(box.min);
+      node.min.copy(centre).addScaledVector(size, -0.5);
+      node.max.copy(centre).addScaledVector(size, 0.5);
       if (node.intersectsBox(body) && shown.containsPoint(centre)) return false;
     }
   }

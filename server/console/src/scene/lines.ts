@@ -64,7 +64,7 @@ export class Outline {
     this.lines.visible = picked !== null;
     if (!picked) return;
     this.lines.position.copy(picked.centre);
-    this.lines.scale.setScalar(picked.edgeM * 1.08);
+    this.lines.scale.copy(picked.size).multiplyScalar(1.08);
   }
 }
 

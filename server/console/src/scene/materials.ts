@@ -4,10 +4,10 @@
  * cube, so edges, faces and depth are exact), and boxes that say which voxel they are instead of a colour. */
 
 import { DataTexture, DoubleSide, GLSL3, ShaderMaterial, Vector2, Vector3, Vector4, type IUniform } from "three";
-import { HEAT_STEP_K, HEAT_ZERO_K } from "../decode/pack.ts";
+import { DIFFICULTY_STEP, HEAT_STEP_K, HEAT_ZERO_K, RISE_STEP_M, SLOPE_STEP_DEG } from "../decode/pack.ts";
 import { OVER, rgbOf, textureOf, UNDER } from "../palettes.ts";
 
-export const FIELD_CODES = { colour: 0, temperature: 1, probability: 2, height: 3, age: 4, robot: 5 } as const;
+export const FIELD_CODES = { colour: 0, temperature: 1, probability: 2, height: 3, age: 4, robot: 5, difficulty: 6, slope: 7, step: 8 } as const;
 /** A box spreads over at most this much of its edge in a picture: the diagonal, and some for perspective. */
 const SPREAD = 1.9;
 
@@ -35,6 +35,8 @@ export const uniforms = {
   /** Colour of the robot that changed it last; negative: nobody knows. */
   uRobot: { value: new Vector3(-1, -1, -1) },
   uObject: { value: 0 },
+  /** Thickness of a level's surfaces, m; 0: the map is none. */
+  uLevelM: { value: 0 },
 } satisfies Record<string, IUniform>;
 
 const VERTEX = `
@@ -44,13 +46,13 @@ in vec4 heat;     // mean and hottest, in steps, two bytes each
 uniform int uField;
 uniform vec2 uRange, uBand;
 uniform vec3 uLow, uHigh, uBare, uFaded, uRobot, uOver, uUnder;
-uniform float uMinP, uPointMax, uAge, uFresh;
+uniform float uMinP, uPointMax, uAge, uFresh, uLevelM;
 uniform vec4 uViewport;
 uniform sampler2D uPalette;
 flat out vec3 vColour;
 flat out float vBare;
 flat out vec3 vCentre;   // from the eye, along the map's axes
-flat out float vHalf;
+flat out vec3 vHalf;
 flat out vec4 vLens;
 flat out uint vVertex;
 flat out float vLight;
@@ -66,6 +68,15 @@ vec3 shade(float x) {
 void main() {
   vec4 world = modelMatrix * vec4(place.xyz + 0.5, 1.0);
   float edge = modelMatrix[0].x;
+  vHalf = vec3(edge, edge, modelMatrix[2].z) * 0.5;
+  float millimetres = heat.x + 256.0 * heat.y;
+  float top = world.z + vHalf.z;
+  // A surface of a level lies at its own height, and reaches down to the lowest one around it.
+  if (uLevelM > 0.0 && millimetres > 0.0) {
+    top = world.z - vHalf.z + (millimetres - 1.0) * 0.001;
+    vHalf.z = 0.5 * (uLevelM + (heat.z + 256.0 * heat.w) * 0.001);
+    world.z = top - vHalf.z;
+  }
   float p = place.w / 255.0;
   int flags = int(colour.a * 255.0 + 0.5);
   bool coloured = (flags & 1) != 0;
@@ -75,9 +86,8 @@ void main() {
   bool hidden = p < uMinP || any(lessThan(world.xyz, uLow)) || any(greaterThan(world.xyz, uHigh)) || seen.z > -edge * 0.5;
   if (hidden) gl_Position = vec4(0.0, 0.0, 2.0, 1.0);
   vLens = vec4(projectionMatrix[0][0], projectionMatrix[1][1], projectionMatrix[2][0], projectionMatrix[2][1]);
-  gl_PointSize = min(edge * GROWN * vLens.y * uViewport.w * 0.5 / max(-seen.z, edge * 0.6) + 1.0, uPointMax);
+  gl_PointSize = min(max(edge, 1.2 * vHalf.z) * GROWN * vLens.y * uViewport.w * 0.5 / max(-seen.z, edge * 0.6) + 1.0, uPointMax);
   vCentre = world.xyz - cameraPosition;
-  vHalf = edge * 0.5;
   vVertex = uint(gl_VertexID);
   // Lit by those of its open faces that the eye can see, the more the straighter; by all others if there is none.
   vec3 eye = normalize(-vCentre);
@@ -98,8 +108,14 @@ void main() {
     vColour = warm ? shade((hottest - uRange.x) / span) : uBare;
     vBare = warm ? 0.0 : 1.0;
   } else if (uField == 2) vColour = shade((p - uRange.x) / span);
-  else if (uField == 3) vColour = shade((world.z - uRange.x) / span);
-  else if (uField == 5) {
+  else if (uField == 3) vColour = shade(((uLevelM > 0.0 ? top : world.z) - uRange.x) / span);
+  else if (uField >= 6) {
+    // Codes of scene/ground.ts.
+    float value = uField == 6 ? colour.r * ${(255 * DIFFICULTY_STEP).toFixed(2)} : uField == 7 ? colour.g * ${(255 * SLOPE_STEP_DEG).toFixed(2)} : colour.b * ${(255 * RISE_STEP_M).toFixed(2)};
+    bool known = coloured && (uField != 7 || colour.g < 0.998);
+    vColour = known ? shade((value - uRange.x) / span) : uBare;
+    vBare = known ? 0.0 : 1.0;
+  } else if (uField == 5) {
     vColour = uRobot.x < 0.0 ? uBare : uRobot * (0.45 + 0.55 * p);
     vBare = uRobot.x < 0.0 ? 1.0 : 0.0;
   } else vColour = shade(1.0 - (uAge - uRange.x) / span);
@@ -117,7 +133,7 @@ precision highp int;
 flat in vec3 vColour;
 flat in float vBare;
 flat in vec3 vCentre;
-flat in float vHalf;
+flat in vec3 vHalf;
 flat in vec4 vLens;
 flat in uint vVertex;
 flat in float vLight;
@@ -132,7 +148,7 @@ const SQUARE = `${FRAGMENT_HEAD}
 out vec4 outColour;
 void main() {
   // Alpha tells the edge of the square to the shading by depth: scene/eye_dome.ts.
-  outColour = vec4(vColour * mix(vLight, 0.9, vBare * QUIET), (log2(2.0 * vHalf) + 8.0) / 12.0);
+  outColour = vec4(vColour * mix(vLight, 0.9, vBare * QUIET), (log2(2.0 * vHalf.x) + 8.0) / 12.0);
 }`;
 
 /** Where the pixel's ray meets the cube; `t` is the depth along the view's axis. */

@@ -17,6 +17,8 @@ export interface Picked {
   readonly node: Triple;
   readonly depth: number;
   readonly edgeM: number;
+  /** Size of the node, m. */
+  readonly size: Vector3;
   readonly centre: Vector3;
   /** Where the pixel's ray meets the node's surface; m. */
   readonly point: Vector3;
@@ -103,14 +105,15 @@ export class Picker {
     const node = nodeOf(cell, row);
     if (!node) return null;
     const edgeM = this.cells.edgeM / 2 ** cell.depth;
-    const centre = new Vector3(...node).addScalar(0.5).multiplyScalar(edgeM).add(cell.box.min);
+    const size = this.cells.sizeAt(cell.depth);
+    const centre = new Vector3(...node).addScalar(0.5).multiply(size).add(cell.box.min);
     const { camera, canvas } = this.stage;
     const ndc = new Vector3((x / canvas.clientWidth) * 2 - 1, 1 - (y / canvas.clientHeight) * 2, 0.5);
     const ray = ndc.unproject(camera).sub(camera.position);
     const forward = camera.getWorldDirection(new Vector3());
     const point = camera.position.clone().addScaledVector(ray, depthM / ray.dot(forward));
     const isVoxel = cell.depth === this.cells.depthMax;
-    return { cell, row, node, depth: cell.depth, edgeM, centre, point, isVoxel };
+    return { cell, row, node, depth: cell.depth, edgeM, size, centre, point, isVoxel };
   }
 }
 

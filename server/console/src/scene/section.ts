@@ -27,14 +27,14 @@ export function profileOf(cells: Cells, from: Vector3, to: Vector3): Profile | n
   if (lengthM < stepM) return null;
   way.divideScalar(lengthM);
   const tops = new Float64Array(Math.ceil(lengthM / stepM)).fill(NaN);
-  visitShown(cells, (x, y, z, edgeM) => {
+  visitShown(cells, (x, y, top, edgeM) => {
     const [dx, dy] = [x - from.x, y - from.y];
     // The line crosses the node's square if it comes nearer to the middle than half of its width across the line.
     if (Math.abs(dx * way.y - dy * way.x) > (edgeM / 2) * (Math.abs(way.x) + Math.abs(way.y))) return;
     const along = dx * way.x + dy * way.y;
     const half = edgeM / 2;
     for (let n = Math.max(Math.floor((along - half) / stepM), 0); n <= Math.min(Math.floor((along + half - 1e-9) / stepM), tops.length - 1); n++) {
-      if (!(tops[n] >= z + half)) tops[n] = z + half;
+      if (!(tops[n] >= top)) tops[n] = top;
     }
   });
   return { stepM, tops };
@@ -52,12 +52,12 @@ export function volumeOver(cells: Cells, corners: readonly Vector3[]): { volumeM
   const [i0, j0] = [Math.floor(left / edgeM), Math.floor(low / edgeM)];
   const side = Math.ceil(wideM / edgeM) + 2;
   const tops = new Float64Array(side * side).fill(NaN);
-  visitShown(cells, (x, y, z, nodeM) => {
+  visitShown(cells, (x, y, nodeTop, nodeM) => {
     const half = nodeM / 2;
     const first = (centre: number, begin: number) => Math.max(Math.floor((centre - half) / edgeM + 1e-6) - begin, 0);
     const last = (centre: number, begin: number) => Math.min(Math.ceil((centre + half) / edgeM - 1e-6) - begin, side) - 1;
     for (let j = first(y, j0); j <= last(y, j0); j++) {
-      for (let i = first(x, i0); i <= last(x, i0); i++) if (!(tops[j * side + i] >= z + half)) tops[j * side + i] = z + half;
+      for (let i = first(x, i0); i <= last(x, i0); i++) if (!(tops[j * side + i] >= nodeTop)) tops[j * side + i] = nodeTop;
     }
   });
   let [volumeM3, inside, known] = [0, 0, 0];
@@ -75,16 +75,16 @@ export function volumeOver(cells: Cells, corners: readonly Vector3[]): { volumeM
   return inside ? { volumeM3, covered: known / inside } : null;
 }
 
-/** Centres and edges of all nodes that are shown, m. */
-function visitShown(cells: Cells, take: (x: number, y: number, z: number, edgeM: number) => void): void {
+/** Middles and tops of all nodes that are shown, and their edges, m. */
+function visitShown(cells: Cells, take: (x: number, y: number, top: number, edgeM: number) => void): void {
   const { uLow, uHigh, uMinP } = uniforms;
   const [low, high] = [uLow.value, uHigh.value];
   for (const { bytes, depth, box } of cells.all.values()) {
-    const edgeM = cells.edgeM / 2 ** depth;
+    const [edgeM, tallM] = [cells.edgeM / 2 ** depth, cells.heightM / 2 ** depth];
     for (let at = 0; at < bytes.length; at += STRIDE) {
-      const x = box.min.x + (bytes[at] + 0.5) * edgeM, y = box.min.y + (bytes[at + 1] + 0.5) * edgeM, z = box.min.z + (bytes[at + 2] + 0.5) * edgeM;
+      const x = box.min.x + (bytes[at] + 0.5) * edgeM, y = box.min.y + (bytes[at + 1] + 0.5) * edgeM, z = box.min.z + (bytes[at + 2] + 0.5) * tallM;
       if (x < low.x || y < low.y || z < low.z || x > high.x || y > high.y || z > high.z || bytes[at + 3] / 255 < uMinP.value) continue;
-      take(x, y, z, edgeM);
+      take(x, y, z + tallM / 2, edgeM);
     }
   }
 }

@@ -35,15 +35,15 @@ export class ShownCell {
   /** Until when it pulses, because it changed. */
   freshMs = 0;
   readonly number: number;
-  private readonly edgeM: number;
+  private readonly sizeM: Vector3;
 
-  constructor(cell: Triple, edgeM: number, number: number) {
+  constructor(cell: Triple, edgeM: number, heightM: number, number: number) {
     this.cell = cell;
     this.key = cell.join(",");
-    this.edgeM = edgeM;
+    this.sizeM = new Vector3(edgeM, edgeM, heightM);
     this.number = number;
-    const low = new Vector3(...cell).multiplyScalar(edgeM);
-    this.box = new Box3(low, low.clone().addScalar(edgeM));
+    const low = new Vector3(...cell).multiply(this.sizeM);
+    this.box = new Box3(low, low.clone().add(this.sizeM));
   }
 
   /** Whose evidence is the newest in it, as far as that is known. */
@@ -84,7 +84,7 @@ export class ShownCell {
     geometry.boundingSphere = new Sphere(new Vector3(side / 2, side / 2, side / 2), side);
     const points = new Points(geometry, material);
     points.position.copy(this.box.min);
-    points.scale.setScalar(this.edgeM / side);
+    points.scale.copy(this.sizeM).divideScalar(side);
     points.userData.box = nodesBox(bytes, points);
     points.matrixAutoUpdate = false;
     points.updateMatrix();

@@ -36,14 +36,15 @@ interface Node {
   readonly y: number;
   readonly z: number;
   readonly edgeM: number;
+  readonly tallM: number;
 }
 
 /** As near to a place as a floor is known that is not above it; null: none is. Two callings give the same. */
 export function standing(cells: Cells, near: Vector3): CameraView | null {
   const all = [...cells.all.values()];
   const close = all.filter(({ box }) => box.distanceToPoint(near.clone().setZ(box.min.z)) <= NEAR_M);
-  const found = floorsBelow(close, cells.edgeM, near.z);
-  const floors = found.length ? found : floorsBelow(all, cells.edgeM, near.z);
+  const found = floorsBelow(close, cells, near.z);
+  const floors = found.length ? found : floorsBelow(all, cells, near.z);
   const counts = new Map<number, number>();
   const levelOf = (z: number) => Math.round(z / FLAT_M);
   for (const { z } of floors) counts.set(levelOf(z), (counts.get(levelOf(z)) ?? 0) + 1);
@@ -52,40 +53,43 @@ export function standing(cells: Cells, near: Vector3): CameraView | null {
   const at = floors.filter(({ z }) => Math.abs(z - level * FLAT_M) <= FLAT_M).sort((a, b) => off(a) - off(b) || a.x - b.x || a.y - b.y)[0];
   if (!at) return null;
   const eye = new Vector3(at.x, at.y, at.z + EYES_M);
-  const heading = clearest(all, cells.edgeM, eye) * STEP_RAD;
+  const heading = clearest(all, cells, eye) * STEP_RAD;
   const target = eye.clone().add(new Vector3(Math.cos(heading), Math.sin(heading), 0).multiplyScalar(AHEAD_M));
   return { eye: eye.toArray() as Triple, target: target.toArray() as Triple };
 }
 
-/** All nodes: their centres, m in the map, and edges. */
-function visit(cells: readonly ShownCell[], cellEdgeM: number, take: (x: number, y: number, z: number, edgeM: number) => void): void {
+/** Edge and height of a cell, m. */
+type CellSize = Pick<Cells, "edgeM" | "heightM">;
+
+/** All nodes: their centres, m in the map, edges and heights. */
+function visit(cells: readonly ShownCell[], cell: CellSize, take: (x: number, y: number, z: number, edgeM: number, tallM: number) => void): void {
   for (const { bytes, depth, box } of cells) {
-    const edgeM = cellEdgeM / 2 ** depth;
+    const [edgeM, tallM] = [cell.edgeM / 2 ** depth, cell.heightM / 2 ** depth];
     const { x, y, z } = box.min;
     for (let at = 0; at < bytes.length; at += STRIDE) {
-      take(x + (bytes[at] + 0.5) * edgeM, y + (bytes[at + 1] + 0.5) * edgeM, z + (bytes[at + 2] + 0.5) * edgeM, edgeM);
+      take(x + (bytes[at] + 0.5) * edgeM, y + (bytes[at + 1] + 0.5) * edgeM, z + (bytes[at + 2] + 0.5) * tallM, edgeM, tallM);
     }
   }
 }
 
 /** Tops of nodes with room for a person above them, one a column: the highest that is not above a height. */
-function floorsBelow(cells: readonly ShownCell[], cellEdgeM: number, topM: number): Node[] {
-  const widthM = cells.reduce((most, { points, depth }) => (points ? Math.max(most, cellEdgeM / 2 ** depth) : most), COLUMN_M);
+function floorsBelow(cells: readonly ShownCell[], cell: CellSize, topM: number): Node[] {
+  const widthM = cells.reduce((most, { points, depth }) => (points ? Math.max(most, cell.edgeM / 2 ** depth) : most), COLUMN_M);
   const columns = new Map<number, Node[]>();
-  visit(cells, cellEdgeM, (x, y, z, edgeM) => {
-    if (z < topM - STOREY_M - edgeM || z > topM + ROOM_M + edgeM) return;
+  visit(cells, cell, (x, y, z, edgeM, tallM) => {
+    if (z < topM - STOREY_M - tallM || z > topM + ROOM_M + tallM) return;
     const key = Math.floor(x / widthM) * COLUMNS + Math.floor(y / widthM);
     const column = columns.get(key);
-    if (column) column.push({ x, y, z, edgeM });
-    else columns.set(key, [{ x, y, z, edgeM }]);
+    if (column) column.push({ x, y, z, edgeM, tallM });
+    else columns.set(key, [{ x, y, z, edgeM, tallM }]);
   });
   const found: Node[] = [];
   for (const column of columns.values()) {
     const rising = column.sort((a, b) => a.z - b.z || a.x - b.x || a.y - b.y);
     for (let n = rising.length - 1; n >= 0; n--) {
-      const z = rising[n].z + rising[n].edgeM / 2;
+      const z = rising[n].z + rising[n].tallM / 2;
       const above = rising[n + 1];
-      if (z > topM || z < topM - STOREY_M || (above && above.z - above.edgeM / 2 < z + ROOM_M)) continue;
+      if (z > topM || z < topM - STOREY_M || (above && above.z - above.tallM / 2 < z + ROOM_M)) continue;
       found.push({ ...rising[n], z });
       break;
     }
@@ -94,10 +98,10 @@ function floorsBelow(cells: readonly ShownCell[], cellEdgeM: number, topM: numbe
 }
 
 /** The heading, counted from +x to +y, in which one sees farthest on the average; where nothing is met is no sight. */
-function clearest(cells: readonly ShownCell[], cellEdgeM: number, eye: Vector3): number {
+function clearest(cells: readonly ShownCell[], cell: CellSize, eye: Vector3): number {
   const rows = 2 * UP + 1;
   const metM = new Array<number>(HEADINGS * rows).fill(Infinity);
-  visit(cells, cellEdgeM, (x, y, z, edgeM) => {
+  visit(cells, cell, (x, y, z, edgeM) => {
     const distanceM = Math.max(Math.sqrt((x - eye.x) ** 2 + (y - eye.y) ** 2 + (z - eye.z) ** 2), edgeM);
     const half = edgeM / 2 / distanceM / STEP_RAD;
     const up = Math.asin((z - eye.z) / distanceM) / STEP_RAD;

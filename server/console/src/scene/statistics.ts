@@ -4,6 +4,7 @@ import { Vector3 } from "three";
 import { HEAT_STEP_K, HEAT_ZERO_K, STRIDE, WARM } from "../decode/pack.ts";
 import type { Field } from "../look.ts";
 import type { Cells } from "./cells.ts";
+import { SLOPE_MAX_DEG, STEP_MAX_M } from "./ground.ts";
 import type { ShownCell } from "./shown_cell.ts";
 
 const SAMPLES = 40_000;
@@ -11,6 +12,10 @@ const SAMPLES = 40_000;
 /** 2nd percentile and 99th of what is drawn, in the shader's units; null: nothing has this field. */
 export function rangeOf(cells: Cells, field: Field, lowZ: number, highZ: number): [number, number] | null {
   if (field === "probability") return [0.5, 1];
+  // Up to what a usual vehicle passes.
+  if (field === "difficulty") return [0, 1];
+  if (field === "slope") return [0, SLOPE_MAX_DEG];
+  if (field === "step") return [0, STEP_MAX_M];
   if (field === "age") {
     let oldest = 1;
     for (const { points, lm } of cells.all.values()) if (points) oldest = Math.max(oldest, cells.ageOf(lm));
@@ -19,10 +24,10 @@ export function rangeOf(cells: Cells, field: Field, lowZ: number, highZ: number)
   const found: number[] = [];
   const stride = Math.max(1, Math.floor(cells.drawn / SAMPLES));
   for (const cell of cells.all.values()) {
-    const edgeM = cells.edgeM / 2 ** cell.depth;
+    const tallM = cells.heightM / 2 ** cell.depth;
     for (let row = 0; row < cell.count; row += stride) {
       const at = row * STRIDE;
-      const z = cell.box.min.z + (cell.bytes[at + 2] + 0.5) * edgeM;
+      const z = cell.box.min.z + (cell.bytes[at + 2] + 0.5) * tallM;
       if (z < lowZ || z > highZ) continue;
       if (field === "height") found.push(z);
       else if (cell.bytes[at + 7] & WARM) found.push(hottestK(cell, at));

@@ -62,11 +62,11 @@ function freeAround(cells: Cells, place: Vector3): Float32Array {
   const [low, high] = [uLow.value, uHigh.value];
   for (const { bytes, depth, box } of cells.all.values()) {
     if (!bytes.length || !box.intersectsBox(near)) continue;
-    const edgeM = cells.edgeM / 2 ** depth;
+    const [edgeM, tallM] = [cells.edgeM / 2 ** depth, cells.heightM / 2 ** depth];
     for (let at = 0; at < bytes.length; at += STRIDE) {
       const x = box.min.x + (bytes[at] + 0.5) * edgeM;
       const y = box.min.y + (bytes[at + 1] + 0.5) * edgeM;
-      const z = box.min.z + (bytes[at + 2] + 0.5) * edgeM;
+      const z = box.min.z + (bytes[at + 2] + 0.5) * tallM;
       if (x < low.x || y < low.y || z < low.z || x > high.x || y > high.y || z > high.z) continue;
       if (bytes[at + 3] / 255 < uMinP.value) continue;
       cover(metM, x - place.x, y - place.y, z - place.z, edgeM);

@@ -1,10 +1,18 @@
 /** What the colours mean: of the field that is shown, and of no other; its ends can be locked. */
 
+import { classColours, unsureColour } from "../class_colours.ts";
 import { fill, h } from "../dom.ts";
 import { KEPT } from "../log_book.ts";
 import { FIELDS, type Field, type Look } from "../look.ts";
 import { OVER, robotColour, stopsOf, UNDER } from "../palettes.ts";
+import { SLOPE_MAX_DEG, STEP_MAX_M } from "../scene/ground.ts";
 import { clock, metres, thousands } from "../units.ts";
+
+/** Names that colours stand for: of robots, and of classes where the map counts them. */
+export interface Names {
+  readonly robots: readonly string[];
+  readonly classes: readonly string[];
+}
 
 /** What the log tells: the unit of ages, how much of the range's own it is, and how far back the log is known. */
 export interface Told {
@@ -39,9 +47,9 @@ export class Legend {
   private locked = false;
 
   /** `range` in the look's unit; null: nothing that is shown has this field. */
-  show(look: Look, range: [number, number] | null, robots: readonly string[], told: Told, values: Values): void {
+  show(look: Look, range: [number, number] | null, { robots, classes }: Names, told: Told, values: Values): void {
     const locked = look.ranges[look.field] !== undefined;
-    const state = JSON.stringify([look.field, range?.map((end) => end.toFixed(2)), locked, look.field === "robot" && robots, told, values]);
+    const state = JSON.stringify([look.field, range?.map((end) => end.toFixed(2)), locked, look.field === "robot" ? robots : look.field === "colour" && classes, told, values]);
     const controls = () => [...this.element.querySelectorAll<HTMLElement>("input, button")];
     const focused = controls().indexOf(document.activeElement as HTMLElement);
     // Whoever types an end is not disturbed by one that follows what is shown.
@@ -52,15 +60,16 @@ export class Legend {
     this.shown = state;
     this.locked = locked;
     const { label, palette } = FIELDS.find(({ field }) => field === look.field)!;
-    const bare = h("p", { class: "bare" }, h("span", { class: "flat", "aria-hidden": "true" }), bareText(look.field, told));
+    const bare = h("p", { class: "bare" }, h("span", { class: "flat", "aria-hidden": "true" }), bareText(look.field, told, classes.length > 0));
     if (look.field === "robot") return fill(this.element, h("h2", {}, "Robot that added to the cell last"), ...robots.map((name) => named(name, robots)), byCell(told), bare);
+    if (look.field === "colour" && classes.length) return fill(this.element, h("h2", {}, "Class with the most votes"), ...classList(classes), bare);
     if (!palette) return fill(this.element, h("h2", {}, label), h("p", {}, "As the cameras saw it."), bare);
     if (!range) return fill(this.element, h("h2", {}, label), h("p", {}, `Nothing shown has a ${label.toLowerCase()}.`), bare);
     const isAge = look.field === "age";
     fill(
       this.element, h("h2", {}, titleOf(look.field, told, values)), values.histogram && bars(values.histogram, range, openEnds(look.field, range, values)),
       bar(stopsOf(palette), openEnds(look.field, range, values), isAge), this.ends(look.field, range, told, values),
-      ...beyond(look.field, range, values), look.field === "temperature" ? bare : null,
+      ...beyond(look.field, range, values), look.field === "temperature" || isOfGround(look.field) ? bare : null,
       ...(isAge ? agesSaid(range, told) : []),
       isAge && told.log !== "whole" ? h("p", {}, told.log === "read" ? READING : `or older: changed ${FAR}`) : null,
     );
@@ -70,7 +79,7 @@ export class Legend {
   private ends(field: Field, range: [number, number], told: Told, { shift }: Values): HTMLElement {
     const isAge = field === "age";
     const { unit, size } = isAge ? told : { unit: FIELDS.find((one) => one.field === field)!.unit, size: 1 };
-    const digits = field === "probability" ? 2 : isAge && size === 1 ? 0 : 1;
+    const digits = field === "probability" || field === "step" ? 2 : isAge && size === 1 ? 0 : 1;
     const wrong = h("p", { class: "error", role: "alert" });
     const take = () => {
       const [low, high] = inputs.map((input) => size * input.valueAsNumber + shift);
@@ -109,6 +118,7 @@ function agesSaid([low, high]: [number, number], told: Told): HTMLElement[] {
 
 function titleOf(field: Field, told: Told, { shift }: Values): string {
   const { label, unit } = FIELDS.find((one) => one.field === field)!;
+  if (field === "difficulty") return "Difficulty for a usual vehicle";
   if (field === "age") return `Age by cell, ${told.unit} before the newest measurement`;
   if (field === "height" && shift) return `Height over the floor, ${unit}`;
   return `${label}${unit ? `, ${unit}` : ""}`;
@@ -117,26 +127,46 @@ function titleOf(field: Field, told: Told, { shift }: Values): string {
 /** Whether something of the map lies below the lower end, and above the upper one. */
 function openEnds(field: Field, [low, high]: [number, number], { histogram }: Values): [boolean, boolean] {
   if (field === "age") return [false, false];
+  if (isOfGround(field)) return [false, true];
   return histogram ? [histogram.least < low, histogram.most > high] : [false, false];
 }
 
 /** What the end blocks stand for, in words. */
 function beyond(field: Field, range: [number, number], values: Values): HTMLElement[] {
   const { shift, histogram } = values;
+  const line = (colour: string, text: string) => h("p", { class: "bare" }, block(colour), text);
+  if (isOfGround(field)) {
+    const { unit } = FIELDS.find((one) => one.field === field)!;
+    return [line(OVER, `above ${Number(range[1].toFixed(2))}${unit && ` ${unit}`}`), h("p", { class: "hint" }, `A usual vehicle passes slopes of ${SLOPE_MAX_DEG}° and steps of ${100 * STEP_MAX_M} cm; a difficulty above 1 is more.`)];
+  }
   if (!histogram) return [];
   const { unit } = FIELDS.find((one) => one.field === field)!;
   const [isBelow, isAbove] = openEnds(field, range, values);
   const said = (value: number) => `${rounded(value - shift, 1)} ${unit}`;
   const [lowest, highest] = field === "temperature" ? ["coldest", "hottest"] : ["lowest", "highest"];
-  const line = (colour: string, text: string) => {
-    const block = h("span", { class: "flat", "aria-hidden": "true" });
-    block.style.background = colour;
-    return h("p", { class: "bare" }, block, text);
-  };
   return [
     ...(isAbove ? [line(OVER, `above ${said(range[1])}; ${highest} ${said(histogram.most)}`)] : []),
     ...(isBelow ? [line(UNDER, `below ${said(range[0])}; ${lowest} ${said(histogram.least)}`)] : []),
   ];
+}
+
+/** A patch of a colour. */
+function block(colour: string): HTMLElement {
+  const found = h("span", { class: "flat", "aria-hidden": "true" });
+  found.style.background = colour;
+  return found;
+}
+
+const cssOf = (rgb: readonly number[]) => `rgb(${rgb.join(" ")})`;
+
+function isOfGround(field: Field): boolean {
+  return field === "difficulty" || field === "slope" || field === "step";
+}
+
+/** Each class in its colour, and in the paler one of voxels in which it hardly leads. */
+function classList(classes: readonly string[]): HTMLElement[] {
+  const rows = classColours(classes.length).map((colour, n) => h("li", {}, block(cssOf(colour)), block(cssOf(unsureColour(colour))), classes[n]!));
+  return [h("ul", { class: "classes" }, ...rows), h("p", { class: "hint" }, "Paler: unsure, it leads by less than two votes.")];
 }
 
 /** Never minus nothing. */
@@ -144,7 +174,9 @@ function rounded(end: number, digits: number): string {
   return end.toFixed(digits).replace(/^-(0(\.0*)?)$/, "$1");
 }
 
-function bareText(field: Field, { log }: Told): string {
+function bareText(field: Field, { log }: Told, isOfClasses: boolean): string {
+  if (isOfGround(field)) return "not told: stands on the ground, is seen from afar, or has too little around it";
+  if (field === "colour" && isOfClasses) return "nothing was named";
   if (field === "robot") return log === "read" ? READING : `not known: evidence was taken out, and who brought the rest is not kept${log === "short" ? `, or it changed ${FAR}` : ""}`;
   return field === "temperature" ? "no temperature was measured" : "no colour was measured";
 }

@@ -8,7 +8,7 @@ import { pageZone, setPageZone, zoneNames } from "../zone.ts";
 export function mapFacts({ geometry, sensor_model }: MapInfo): HTMLElement {
   const edge = geometry.voxel_edge_um / 1e6;
   const lines = [
-    `voxels of ${metres(edge)}`,
+    `voxels of ${metres(edge)}${geometry.height_step_um === undefined ? "" : ` and ${metres(geometry.height_step_um / 1e6)} height`}`,
     `cells of ${metres(edge * 2 ** geometry.depth)}`,
     `shown: p above ${sensor_model.p_occupied}`,
     geometry.channels.map(({ name }) => name).join(", ") || "no channels",

@@ -6,6 +6,7 @@ import type { Heights } from "../heights.ts";
 import type { Triple } from "../messages.ts";
 import type { Cells } from "../scene/cells.ts";
 import { floorPlanOf, slabOf, storeyAt, type FloorPlan } from "../scene/floor_plan.ts";
+import { uniforms } from "../scene/materials.ts";
 import type { Stage } from "../scene/stage.ts";
 import { storeyName } from "./look_panel.ts";
 import { drawPlan, fitOf, pixelOf, placeOf, type PlanInk, type PlanMarks } from "./plan_picture.ts";
@@ -77,7 +78,7 @@ export class PlanPanel {
     if (!this.isOpen && this.plan && !this.small.checkVisibility()) return; // narrow pages have no room for it
     const { floorsM } = this.heights.storeys;
     if (!this.isChosen) this.storey = storeyAt(floorsM, this.stage.view.target[2]);
-    const madeOf = JSON.stringify([this.cells.head, this.cells.drawn, floorsM, this.storey]);
+    const madeOf = JSON.stringify([this.cells.head, this.cells.momentKey, this.cells.drawn, uniforms.uMinP.value, floorsM, this.storey]);
     // A raster of all that is there takes the time of a frame or more: while a large map comes, none is made.
     const isComing = this.cells.isFetching || this.cells.waiting > 0 || this.cells.needsPlan;
     if (madeOf !== this.madeOf && performance.now() >= this.nextMs && !(isComing && !this.isOpen) && this.cells.firstPictureMs !== null) {

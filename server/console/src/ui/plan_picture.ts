@@ -3,9 +3,10 @@
  * The same drawing is the plan over the map, the small one at its edge, and the one in a report. */
 
 import { DataTexture } from "three";
+import { DIFFICULTY_STEP, NO_SLOPE, RISE_STEP_M, SLOPE_STEP_DEG } from "../decode/pack.ts";
 import type { Finding } from "../findings.ts";
 import type { CameraView, Field } from "../look.ts";
-import { rgbOf, textureOf } from "../palettes.ts";
+import { OVER, rgbOf, textureOf } from "../palettes.ts";
 import type { Triple } from "../messages.ts";
 import { columnAt, FLOOR, FOG, GAP, THING, WALL, type FloorPlan } from "../scene/floor_plan.ts";
 import { roundM } from "./reference_frame.ts";
@@ -15,6 +16,8 @@ export interface PlanInk {
   readonly field: Field;
   /** Ends of temperatures, K. */
   readonly rangeK: [number, number] | null;
+  /** Ends of what is told of a level's ground. */
+  readonly range: [number, number];
 }
 
 export interface PlanMarks {
@@ -44,6 +47,10 @@ const GROUNDS: Record<"dark" | "light", { fog: Rgb; stripe: Rgb; gap: Rgb; gapSt
   },
 };
 const INFERNO = textureOf("inferno") as DataTexture;
+const VIRIDIS = textureOf("viridis") as DataTexture;
+const BEYOND = rgbOf(OVER).map((part) => Math.round(255 * part)) as unknown as Rgb;
+/** Of a level: byte of a node's colour in which a field is, and its step. */
+const CODED = { difficulty: { byte: 0, step: DIFFICULTY_STEP }, slope: { byte: 1, step: SLOPE_STEP_DEG }, step: { byte: 2, step: RISE_STEP_M } };
 /** Of a plan in its place, and the least of the scale bar, px. */
 const FILLED = 0.94;
 const BAR_PX = 90;
@@ -110,9 +117,10 @@ function rasterOf(plan: FloorPlan, ink: PlanInk): OffscreenCanvas {
 }
 
 /** One pixel a column, clear where there is fog. */
-function makeRaster({ width, height, kinds, colours, kelvins }: FloorPlan, { theme, field, rangeK }: PlanInk): OffscreenCanvas {
+function makeRaster({ width, height, kinds, colours, kelvins }: FloorPlan, { theme, field, rangeK, range }: PlanInk): OffscreenCanvas {
   const image = new ImageData(width, height);
   const ground = GROUNDS[theme];
+  const coded = field in CODED ? CODED[field as keyof typeof CODED] : null;
   for (let b = 0; b < height; b++) {
     for (let a = 0; a < width; a++) {
       const from = b * width + a;
@@ -122,7 +130,9 @@ function makeRaster({ width, height, kinds, colours, kelvins }: FloorPlan, { the
         : kind === GAP && (a + b) % 4 < 2 ? ground.gapStripe : ground.gap;
       if (kind >= FLOOR && kind <= WALL) {
         if (field === "colour" && colours[4 * from + 3] && kind !== WALL) ink = [colours[4 * from], colours[4 * from + 1], colours[4 * from + 2]];
-        if (field === "temperature" && kelvins[from] && rangeK) ink = heat(kelvins[from], rangeK);
+        if (field === "temperature" && kelvins[from] && rangeK) ink = shaded(INFERNO, kelvins[from], rangeK);
+        const code = coded ? colours[4 * from + coded.byte]! : NO_SLOPE;
+        if (coded && colours[4 * from + 3] && !(field === "slope" && code === NO_SLOPE)) ink = shaded(VIRIDIS, code * coded.step, range);
       }
       image.data.set([...ink, 255], 4 * ((height - 1 - b) * width + a));
     }
@@ -132,9 +142,10 @@ function makeRaster({ width, height, kinds, colours, kelvins }: FloorPlan, { the
   return canvas;
 }
 
-function heat(kelvin: number, [low, high]: [number, number]): Rgb {
-  const at = 4 * Math.round(255 * Math.min(Math.max((kelvin - low) / (high - low), 0), 1));
-  const data = INFERNO.image.data as Uint8Array;
+function shaded(palette: DataTexture, value: number, [low, high]: [number, number]): Rgb {
+  if (palette === VIRIDIS && value > high) return BEYOND;
+  const at = 4 * Math.round(255 * Math.min(Math.max((value - low) / (high - low), 0), 1));
+  const data = palette.image.data as Uint8Array;
   return [data[at], data[at + 1], data[at + 2]];
 }
 

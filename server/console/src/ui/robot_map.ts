@@ -10,7 +10,8 @@ const PAUSE_MS = 1500;
 /** After a picture that could not be made: the server may have been busy. */
 const AGAIN_MS = 5000;
 const WAIT_MS = 20_000;
-const LAYERS: Record<Field, string> = {
+/** Levels have fields that the server draws no pictures of, and no pictures at all. */
+const LAYERS: Partial<Record<Field, string>> = {
   colour: "colour", temperature: "temperature", probability: "probability", height: "depth", age: "age", robot: "colour",
 };
 const SIZE = { width: "320", height: "240", focal_px: "250" };
@@ -34,11 +35,12 @@ export class RobotMap {
   show(robot: string | null, pose: Pose | null, field: Field, head: number): void {
     if (robot !== this.robot || pose === null) this.clear();
     this.robot = robot;
-    if (robot === null || pose === null) return;
+    const layer = LAYERS[field];
+    if (robot === null || pose === null || layer === undefined) return;
     const [x, y, z] = pose.t_map_rig;
     const [qx, qy, qz, qw] = pose.q_map_rig;
     const places = Object.entries({ x, y, z, qx, qy, qz, qw }).map(([name, value]) => [name, value.toFixed(4)]);
-    const query = new URLSearchParams([...places, ...Object.entries({ ...SIZE, layer: LAYERS[field] })]).toString();
+    const query = new URLSearchParams([...places, ...Object.entries({ ...SIZE, layer })]).toString();
     const wanted = `${robot} ${head} ${query}`;
     if (wanted === this.asked || this.busy || performance.now() < this.nextMs) return;
     this.nextMs = performance.now() + PAUSE_MS;

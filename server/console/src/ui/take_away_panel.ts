@@ -14,6 +14,7 @@ const FORMS: [string, string, string][] = [
   ["ot", "OctoMap .ot", "OctoMap's octree of occupied and free space, with probability and colour"],
   ["bt", "OctoMap .bt", "OctoMap's octree of occupied and free space, small"],
 ];
+const OCTREES = ["ot", "bt"];
 
 export class TakeAwayPanel {
   readonly element = h("section", { "aria-label": "Take away" });
@@ -31,12 +32,14 @@ export class TakeAwayPanel {
     this.api = api;
     this.info = info;
     this.look = look;
-    const { depth, voxel_edge_um } = info.geometry;
+    const { depth, voxel_edge_um, height_step_um } = info.geometry;
     for (let n = depth; n >= Math.max(1, depth - 4); n--) {
       this.level.append(h("option", { value: String(n) }, `${n === depth ? "voxels" : "nodes"} of ${metres((voxel_edge_um / 1e6) * 2 ** (depth - n))}`));
     }
     this.level.addEventListener("change", () => this.show());
-    const buttons = FORMS.map(([form, name, what]) =>
+    // An octree has cubes.
+    const forms = height_step_um === undefined ? FORMS : FORMS.filter(([form]) => !OCTREES.includes(form));
+    const buttons = forms.map(([form, name, what]) =>
       h("button", { type: "button", title: what, onclick: (event: Event) => void this.save(event, () => this.part(form)) }, name),
     );
     fill(

@@ -2,7 +2,8 @@
 
 import { fill, h } from "../dom.ts";
 import type { LinkState } from "../live.ts";
-import { FIELDS, type Field } from "../look.ts";
+import { fieldsOf, type Field } from "../look.ts";
+import { layerText, mapOf } from "../map_layers.ts";
 import type { MapInfo } from "../messages.ts";
 import { isClockTrusted } from "../server_time.ts";
 import { ago, bytes, counted } from "../units.ts";
@@ -18,22 +19,31 @@ export class TopBar {
   private readonly field: HTMLSelectElement;
   private readonly link = h("span", { class: "link", role: "status" });
 
-  constructor(maps: readonly MapInfo[], map: string, loggedIn: boolean, on: { map: (name: string) => void; keys: () => void; share: () => void; logOut: () => void }) {
-    const choice = h("select", { "aria-label": "Map" }, ...maps.map((info) => h("option", { value: info.name, selected: info.name === map }, choiceOf(info))));
-    choice.addEventListener("change", () => on.map(choice.value));
+  constructor(maps: readonly MapInfo[], { name: map, geometry }: MapInfo, loggedIn: boolean, on: { map: (name: string) => void; keys: () => void; share: () => void; logOut: () => void }) {
+    const chooser = (label: string, options: readonly [string, string][], chosen: string) => {
+      const made = h("select", { "aria-label": label }, ...options.map(([name, text]) => h("option", { value: name, selected: name === chosen }, text)));
+      made.addEventListener("change", () => on.map(made.value));
+      return made;
+    };
+    const own = mapOf(map);
+    const layers = maps.filter(({ name }) => mapOf(name) === own);
+    const names = [...new Set(maps.map(({ name }) => mapOf(name)))];
+    const choice = chooser("Map", names.map((name) => [name, choiceOf(name, maps)]), own);
+    const layer = layers.length > 1 ? chooser("Layer", layers.map((one) => [one.name, layerText(one)]), map) : null;
+    const fields = fieldsOf(geometry);
     this.fields = h(
       "div", { class: "segments", role: "group", "aria-label": "Colour by" },
-      ...FIELDS.map(({ field, label }) =>
+      ...fields.map(({ field, label }) =>
         h("button", { type: "button", "data-field": field, onclick: () => this.onField(field) }, label),
       ),
     );
-    this.field = h("select", { class: "field", "aria-label": "Colour by" }, ...FIELDS.map(({ field, label }) => h("option", { value: field }, label)));
+    this.field = h("select", { class: "field", "aria-label": "Colour by" }, ...fields.map(({ field, label }) => h("option", { value: field }, label)));
     this.field.addEventListener("change", () => this.onField(this.field.value as Field));
     const more = h("button", { type: "button", class: "more", title: "Share, theme, keys, log out", "aria-expanded": "false" }, "⋯");
     const button = (label: string, title: string, run: () => void) => h("button", { type: "button", title, onclick: run }, label);
     this.element = h(
       "header", { class: "bar" },
-      h("h1", { class: "brand" }, "cairn"), choice, this.fields, this.field, h("span", { class: "space" }), this.link, more,
+      h("h1", { class: "brand" }, "cairn"), choice, layer, this.fields, this.field, h("span", { class: "space" }), this.link, more,
       h(
         "span", { class: "rare" },
         button("Share", "A link that shows another person the same", on.share),
@@ -69,9 +79,10 @@ export class TopBar {
   }
 }
 
-/** A map by what tells it from others. */
-function choiceOf({ name, cells, size_bytes, branches }: MapInfo): string {
-  return `${name} · ${counted(cells, "cell", "cells")}, ${bytes(size_bytes)}, ${counted(branches, "robot", "robots")}`;
+/** A map by what tells it from others; one of which this token sees a layer alone has its name. */
+function choiceOf(map: string, maps: readonly MapInfo[]): string {
+  const info = maps.find(({ name }) => name === map);
+  return info ? `${map} · ${counted(info.cells, "cell", "cells")}, ${bytes(info.size_bytes)}, ${counted(info.branches, "robot", "robots")}` : map;
 }
 
 /** Dark or light: as the system says, or as was chosen here. */

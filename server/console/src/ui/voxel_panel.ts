@@ -1,9 +1,13 @@
 /** What was clicked: first what the picture knows, then the server's own numbers. */
 
 import type { Api } from "../api.ts";
+import { classColours, classOf } from "../class_colours.ts";
 import { facts, fill, h } from "../dom.ts";
 import type { Look } from "../look.ts";
-import type { Channel, Triple } from "../messages.ts";
+import { classesOf } from "../map_layers.ts";
+import type { Channel, MapInfo, Triple } from "../messages.ts";
+import type { Cells } from "../scene/cells.ts";
+import type { Ground } from "../scene/ground.ts";
 import { readingOf, type Picked } from "../scene/picking.ts";
 import { serverNowS } from "../server_time.ts";
 import { ago, celsius, clock, counted, metres } from "../units.ts";
@@ -41,15 +45,15 @@ export interface VoxelAnswer {
 export class VoxelPanel {
   readonly element = h("section", { "aria-label": "Voxel", "aria-live": "polite" });
   private readonly api: Api;
-  private readonly map: string;
+  private readonly info: MapInfo;
   private readonly look: Look;
   /** Whose commit a log entry folded; null: not known here. */
   private readonly robotAt: (seq: number) => string | null;
   private asked = 0;
 
-  constructor(api: Api, map: string, look: Look, robotAt: (seq: number) => string | null) {
+  constructor(api: Api, info: MapInfo, look: Look, robotAt: (seq: number) => string | null) {
     this.api = api;
-    this.map = map;
+    this.info = info;
     this.look = look;
     this.robotAt = robotAt;
     this.clear();
@@ -61,29 +65,48 @@ export class VoxelPanel {
   }
 
   /** `floorM`: what heights are told over, m in the map. */
-  async show(picked: Picked, depthMax: number, floorM: number | null): Promise<void> {
+  async show(picked: Picked, { cells, ground }: { cells: Cells; ground: Ground }, floorM: number | null): Promise<void> {
     const mine = ++this.asked;
+    const classes = classesOf(this.info.geometry.channels);
+    const coarse = cells.isLevel ? ofGround(picked, ground) : ofNode(picked, floorM, classes);
     if (!picked.isVoxel) {
-      fill(this.element, h("h2", {}, "Voxel"), coarse(picked, floorM), h("p", { class: "hint" }, `The hottest in a block ${metres(picked.edgeM)} wide: come closer to ask of one voxel, and who saw it.`));
+      const what = cells.isLevel ? "The mean" : classes.length ? "The most votes" : "The hottest";
+      fill(this.element, h("h2", {}, "Voxel"), coarse, h("p", { class: "hint" }, `${what} in a block ${metres(picked.edgeM)} wide: come closer to ask of one voxel, and who saw it.`));
       return;
     }
-    const side = 2 ** depthMax;
+    const side = 2 ** cells.depthMax;
     const voxel = picked.node.map((place, axis) => place + picked.cell.cell[axis] * side) as Triple;
-    fill(this.element, h("h2", {}, "Voxel"), coarse(picked, floorM), h("p", { class: "hint" }, "Asking the server …"));
+    fill(this.element, h("h2", {}, "Voxel"), coarse, h("p", { class: "hint" }, "Asking the server …"));
     try {
       const { atS } = this.look;
-      const answer = await this.api.json<VoxelAnswer>(`maps/${this.map}/main/voxels/${voxel.join(",")}${atS === null ? "" : `?time=${atS}`}`);
-      if (mine === this.asked) fill(this.element, h("h2", {}, "Voxel"), reading(answer, floorM), exact(answer), whence(answer, this.robotAt(answer.lm)));
+      const answer = await this.api.json<VoxelAnswer>(`maps/${this.info.name}/main/voxels/${voxel.join(",")}${atS === null ? "" : `?time=${atS}`}`);
+      if (mine === this.asked) fill(this.element, h("h2", {}, "Voxel"), cells.isLevel ? coarse : reading(answer, floorM, classes), exact(answer), whence(answer, this.robotAt(answer.lm)));
     } catch (error) {
-      if (mine === this.asked) fill(this.element, h("h2", {}, "Voxel"), coarse(picked, floorM), h("p", { class: "error" }, (error as Error).message));
+      if (mine === this.asked) fill(this.element, h("h2", {}, "Voxel"), coarse, h("p", { class: "error" }, (error as Error).message));
     }
   }
 }
 
 /** The reading first, as one tells it to another. */
-function headline(kelvin: number | null, rgb: number[] | null, z: number, floorM: number | null): HTMLElement {
-  const heat = kelvin === null ? "No temperature" : celsius(kelvin);
-  return h("p", { class: "reading" }, h("strong", {}, heat), rgb && swatch(rgb), floorM !== null && `${metres(z - floorM, 1)} over the floor`);
+function headline(said: string, rgb: number[] | null, z: number, floorM: number | null): HTMLElement {
+  return h("p", { class: "reading" }, h("strong", {}, said), rgb && swatch(rgb), floorM !== null && `${metres(z - floorM, 1)} over the floor`);
+}
+
+const heatText = (kelvin: number | null) => (kelvin === null ? "No temperature" : celsius(kelvin));
+const classText = (name: string, isUnsure: boolean) => `${name}${isUnsure ? " (unsure)" : ""}`;
+
+/** A level's surface: its height, and what hinders a vehicle there. */
+function ofGround(picked: Picked, ground: Ground): HTMLElement {
+  const { heightM, difficulty, slopeDeg, stepM } = ground.reading(picked.cell, picked.row);
+  const known = (value: number | null, text: (value: number) => string) => (value === null ? "not known" : text(value));
+  const numbers = facts([
+    ["difficulty", known(difficulty, (value) => `${value.toFixed(2)}${value > 1 ? ": a usual vehicle does not pass" : ""}`)],
+    ["slope", known(slopeDeg, (value) => `${value.toFixed(1)}°`)],
+    ["largest step", known(stepM, (value) => metres(value))],
+    ["middle", picked.centre.toArray().slice(0, 2).map((value) => value.toFixed(2)).join(", ") + " m"],
+    ["cell", picked.cell.key],
+  ]);
+  return h("div", {}, headline(heightM === null ? "An obstacle" : `Ground at ${metres(heightM)}`, null, 0, null), numbers);
 }
 
 function swatch(rgb: number[]): HTMLElement {
@@ -93,8 +116,10 @@ function swatch(rgb: number[]): HTMLElement {
 }
 
 /** The reading of what was clicked, whatever its size, and the numbers behind it. */
-function coarse({ cell, row, centre, edgeM, node, depth }: Picked, floorM: number | null): HTMLElement {
+function ofNode({ cell, row, centre, edgeM, node, depth }: Picked, floorM: number | null, classes: readonly string[]): HTMLElement {
   const { probability, rgb, meanK, hottestK } = readingOf(cell, row);
+  const named = rgb && classes.length ? classOf(rgb, classes.length) : null;
+  const said = classes.length ? (named ? classText(classes[named.number]!, named.isUnsure) : "No class") : heatText(hottestK);
   const numbers = facts([
     ["colour", rgb ? h("span", {}, swatch(rgb), ` ${rgb.join(", ")}`) : "none measured"],
     ["temperature", meanK === null ? "none measured" : `${celsius(meanK)} mean, ${celsius(hottestK!)} hottest`],
@@ -103,12 +128,15 @@ function coarse({ cell, row, centre, edgeM, node, depth }: Picked, floorM: numbe
     ["cell", cell.key],
     ["node", `${node.join(",")} at depth ${depth}, ${metres(edgeM)} wide`],
   ]);
-  return h("div", {}, headline(hottestK, rgb, centre.z, floorM), numbers);
+  return h("div", {}, headline(said, rgb, centre.z, floorM), numbers);
 }
 
-function reading({ channels, centre_m }: VoxelAnswer, floorM: number | null): HTMLElement {
-  const of = (kind: Channel["kind"]) => channels.find((channel) => channel.kind === kind && channel.weight > 0)?.mean ?? null;
-  return headline(of("temperature")?.[0] ?? null, of("colour"), centre_m[2], floorM);
+function reading({ channels, centre_m }: VoxelAnswer, floorM: number | null, classes: readonly string[]): HTMLElement {
+  const of = (kind: Channel["kind"]) => channels.find((channel) => channel.kind === kind && channel.weight > 0);
+  const named = of("classes");
+  if (!classes.length) return headline(heatText(of("temperature")?.mean[0] ?? null), of("colour")?.mean ?? null, centre_m[2], floorM);
+  const said = named?.class_name === undefined ? "No class" : classText(named.class_name, named.unsure === true);
+  return headline(said, named ? [...classColours(classes.length)[classes.indexOf(named.class_name!)]!] : null, centre_m[2], floorM);
 }
 
 function exact(answer: VoxelAnswer): HTMLElement {
@@ -124,7 +152,7 @@ function exact(answer: VoxelAnswer): HTMLElement {
       const when = measured_s === undefined ? "" : `, ${clock(measured_s)}, ${ago(serverNowS() - measured_s)}`;
       const whence = `(${counted(weight, "sample", "samples")}${when})`;
       if (kind === "colour") return [name, h("span", {}, swatch(mean), ` ${mean.map((value) => value.toFixed(1)).join(", ")} ${whence}`)];
-      if (class_name !== undefined) return [name, `${class_name}${unsure ? " (unsure)" : ""} ${whence.replace("sample", "vote")}`];
+      if (class_name !== undefined) return [name, `${classText(class_name, unsure === true)} ${whence.replace("sample", "vote")}`];
       const spread = sigma === null ? "" : ` ± ${sigma.toFixed(2)} ${unit === "K" ? "°C" : unit}`;
       const value = unit === "K" ? celsius(mean[0], 2) : `${mean[0].toFixed(2)} ${unit}`;
       return [name, `${value}${spread} ${whence}`];

@@ -1,0 +1,68 @@
+/** Laws of the page's modules that need no browser, for a test: what breaks one is printed; sizes of the pictures that are named, too. */
+
+import { readFileSync } from "node:fs";
+import { classColours, classOf, unsureColour } from "../src/class_colours.ts";
+import { fromHash } from "../src/look.ts";
+import type { LogEntry } from "../src/messages.ts";
+import { sizeOf } from "../src/picture_size.ts";
+import { HELD_MAX, Timeline } from "../src/timeline.ts";
+
+const wrong: string[] = [];
+const law = (what: string, holds: boolean) => void (holds || wrong.push(what));
+let state = 7;
+/** Mulberry32. */
+const random = () => {
+  state = (state + 0x6d2b79f5) | 0;
+  let t = Math.imul(state ^ (state >>> 15), 1 | state);
+  t = (t + Math.imul(t ^ (t >>> 7), 61 | t)) ^ t;
+  return ((t ^ (t >>> 14)) >>> 0) / 4294967296;
+};
+
+/** An entry of the log; one without a time of capture is a retract of nothing that is known. */
+function entry(seq: number, capturedS: number | null): LogEntry {
+  const captured = capturedS === null ? null : [capturedS - 1, capturedS];
+  const one = { seq, id: `r.${seq}`, kind: "+", captured_s: captured, pushed_s: 100 + seq, place_m: null, cells: captured ? 1 : 0, retracts: captured ? [] : ["x.1"], note: "" };
+  return one as unknown as LogEntry;
+}
+
+for (let round = 0; round < 50; round++) {
+  const times = Array.from({ length: Math.floor(random() * 40) }, () => (random() < 0.2 ? null : 1000 + Math.floor(random() * 60)));
+  const timeline = new Timeline(null);
+  timeline.add(times.map((timeS, n) => entry(n + 1, timeS)));
+  const captured = times.filter((timeS) => timeS !== null);
+  for (let timeS = 990; timeS < 1070; timeS += 0.5) {
+    const before = captured.filter((one) => one <= timeS);
+    const atS = before.length ? Math.max(...before) : timeS;
+    law("a time's moment is the last commit before it", timeline.momentAt(timeS).atS === atS && timeline.momentAt(timeS).key === String(atS));
+  }
+  const distinct = [...new Set(captured)].sort((a, b) => a - b);
+  law("each time of capture is one moment", timeline.moments.map(({ atS }) => atS).join() === distinct.join());
+  timeline.add([entry(1000, 5000)]);
+  law("a new commit is a moment", timeline.moments.at(-1)?.atS === 5000 && timeline.momentAt(6000).atS === 5000);
+}
+
+const far = new Timeline(null);
+const run = (from: number, to: number) => Array.from({ length: to - from + 1 }, (_, n) => entry(from + n, from + n));
+const isWhole = () => far.lastSeq - far.firstSeq + 1 === far.entries.size;
+const head = 2 * HELD_MAX;
+far.add(run(HELD_MAX + 1, head));
+far.add([entry(head + 1, head + 1)]);
+law("of too many entries the oldest go first", far.firstSeq === HELD_MAX + 2 && far.lastSeq === head + 1 && isWhole());
+far.add(run(HELD_MAX - 999, HELD_MAX + 1), true);
+law("reading back forgets the newest", far.firstSeq === HELD_MAX - 999 && isWhole());
+far.add(run(head + 2, head + 3));
+law("an event leaves no hole before it", isWhole());
+while (far.lastSeq < head + 3) far.add(run(far.lastSeq + 1, Math.min(far.lastSeq + 1000, head + 3)));
+law("what was forgotten is read again, and events join it", far.lastSeq === head + 3 && isWhole());
+
+for (const text of ["1e20", "-1e20", "1e12", "NaN", "Infinity", ""]) {
+  const { look } = fromHash(`#map=a&at=${text}&since=${text}`);
+  // An empty number is 0: the map before all that is in it.
+  law(`#at=${text} is no time`, text === "" || (look.atS === null && look.sinceS === null));
+}
+law("a time of this century is one", fromHash("#map=a&at=1760000040.5").look.atS === 1760000040.5);
+
+const classes = classColours(64);
+law("a class is told by its colour, and by its paler one", classes.every((colour, n) => classOf(colour, 64)?.number === n && classOf(unsureColour(colour), 64)?.number === n));
+
+console.log(JSON.stringify({ classes, pale: classes.map(unsureColour), wrong: [...new Set(wrong)], sizes: process.argv.slice(2).map((path) => sizeOf(new Uint8Array(readFileSync(path)))) }));
