@@ -18,6 +18,9 @@ const TOGETHER_S = 60;
 /** A hottest voxel moves as more is measured: so near to a known one, a hot spot is no other, m. */
 const SAME_M = 0.5;
 
+/** Words of a robot's own note that say that it needs help. */
+export const HELP = /\b(stuck|help|fault|error|lost|blocked|emergency|failed|fallen)\b/i;
+
 export interface NewsItem {
   readonly timeS: number;
   readonly text: string;
@@ -91,7 +94,7 @@ export class NewsBook {
     else this.notes.set(branch, note);
     if (gone) this.add(`${branch} left the team`, null);
     else if (before === undefined) this.add(`${branch} joined`, place);
-    if (!gone && note && note !== before) this.add(`${branch}: ${note}`, place);
+    if (!gone && HELP.test(note) && note !== before) this.add(`${branch}: ${note}`, place);
   }
 
   private add(text: string, place: Triple | null, find: string | null = null): NewsItem {

@@ -389,6 +389,7 @@ export class Cells {
   }
 
   private remove(cell: ShownCell): void {
+    this.settledView = "";
     cell.drop();
     if (this.all.delete(cell.key)) this.free.push(cell.number);
   }
