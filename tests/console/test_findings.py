@@ -28,6 +28,8 @@ HOSTILE = "<img src=x onerror=alert(1)>"
 ROLES = ("operator", "reader")
 LANDED = "c.findings.flight === null && !c.stage.isFlying && c.cells.waiting === 0"
 CELSIUS = "Math.max(...c.findings.all.map(({ celsius }) => celsius))"
+CORNERS = [[0.2, 0.2, 0.0], [1.4, 0.2, 0.0], [1.4, 1.4, 0.0]]
+"""Of a triangle on the floor, m."""
 MIDDLE = """(() => {
   const { clientWidth, clientHeight } = c.stage.canvas;
   return c.picker.at(clientWidth / 2, clientHeight / 2)?.centre.toArray() ?? null;
@@ -138,6 +140,7 @@ def test_a_mark_by_a_click_is_on_another_screen_with_its_pin_and_may_be_changed_
         dialog.get_by_role("button", name="Save").click()
         dialog.wait_for(state="detached")
         other.until("c.findings.marks.all.length === 1", "the mark is on the other screen")
+        other.page.get_by_role("log").get_by_role("button", name=f"furnace-operator marked “{HOSTILE}”").wait_for()
         rows(other).filter(has_text=HOSTILE).get_by_role("button").click()
         rows(other).get_by_text("moves its arm").wait_for()
         rows(other).get_by_text("person by furnace-operator").wait_for()
@@ -185,6 +188,9 @@ def test_what_one_operator_saw_or_dismissed_is_so_on_all_screens_until_it_is_muc
             commit = commit_of(dict.fromkeys(lamp, kelvin + 60), 1)
             api.push(FURNACE, commit)
             other.until(f"{states} === 'new,new,new,seen'", "it is new again")
+            news = other.page.get_by_role("log")
+            news.get_by_role("button", name="mole mapped 1 cell").wait_for()
+            assert "New hot spot" not in news.inner_text(), "it is one that is known"
             api.retract(FURNACE, commits=[str(commit.id)]) if False else None
         desk.until(f"{states} === 'new,new,new,seen'", "it is new again here")
         rows(desk).nth(3).get_by_role("button").first.click()
@@ -240,6 +246,38 @@ def test_an_alarm_is_seen_and_in_the_title_until_it_is_quiet(desk: Console) -> N
     page.get_by_label("Hot spots from").fill("30")
     page.keyboard.press("Enter")
     desk.until(f"c.findings.all.length === {len(SPOTS)}", "all are back")
+
+
+def test_a_reload_keeps_what_is_measured_and_chosen_and_back_undoes_the_flight(desk: Console) -> None:
+    page = desk.page
+    page.keyboard.press("Escape")
+    desk.tell("c.camera.home()")
+    desk.tell("a[0].forEach((p) => c.measure.add(c.stage.controls.target.clone().set(...p)))", CORNERS)
+    desk.settled()
+    before = desk.tell("c.stage.view")
+    rows(desk).nth(1).get_by_role("button").click()
+    desk.until(LANDED, "the eye is there")
+    desk.settled()
+    desk.until("/find=/.test(location.hash) && location.href === c.address", "the address is that of the view")
+    measured = page.get_by_role("region", name="Measure")
+    words, there = measured.inner_text(), desk.tell("c.stage.view")
+    assert "m³" in words
+    page.reload()
+    desk.settled()
+    desk.until("c.findings.all.some(({ id }) => id === c.findings.chosen)", "it is chosen still")
+    assert rows(desk).nth(1).get_by_role("button").first.get_attribute("aria-pressed") == "true"
+    for part in ("eye", "target"):
+        assert desk.tell("c.stage.view")[part] == pytest.approx(there[part], abs=0.011), "no flight again"
+    measured.get_by_text("m³").wait_for()
+    assert measured.inner_text() == words
+    page.go_back()
+    desk.until("c.findings.chosen === null", "Back is followed")
+    desk.settled()
+    for part in ("eye", "target"):
+        assert desk.tell("c.stage.view")[part] == pytest.approx(before[part], abs=0.011)
+    assert desk.tell("c.measure.points.length") == len(CORNERS)
+    measured.get_by_role("button", name="Clear").click()
+    desk.until("!/points=/.test(c.address)", "nothing is measured")
 
 
 def test_a_thousand_marks_are_dots_and_the_first_of_them_pins(desk: Console) -> None:

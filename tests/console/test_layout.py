@@ -1,5 +1,10 @@
 """Sizes of screens, from a wide one to a phone on its side: the map has most of each; fingers hit what they aim at."""
 
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
 import pytest
 from playwright.sync_api import Browser, ViewportSize
 from tests.console.browsing import OVERFLOWING, TABLET, VIEW, Console, findings_of_axe
@@ -9,7 +14,8 @@ pytestmark = pytest.mark.browser
 
 PHONE: ViewportSize = {"width": 390, "height": 844}
 PHONE_ASIDE: ViewportSize = {"width": 844, "height": 390}
-LEAST_SHARES = ((VIEW, 0.70), (TABLET, 0.60), (PHONE, 0.85), (PHONE_ASIDE, 0.85))
+WIDE: ViewportSize = {"width": 1440, "height": 900}
+LEAST_SHARES = ((WIDE, 0.70), (VIEW, 0.70), (TABLET, 0.60), (PHONE, 0.85), (PHONE_ASIDE, 0.85))
 SHARE = """() => {
   let [inside, all] = [0, 0];
   for (let x = 2; x < innerWidth; x += 6) for (let y = 2; y < innerHeight; y += 6) {
@@ -24,6 +30,8 @@ SMALL = """(least) => [...document.querySelectorAll("button, select, summary, in
   .map((e) => [e, (e.type === "checkbox" ? e.closest("label") : e).getBoundingClientRect()])
   .filter(([, {width, height}]) => Math.min(width, height) < least)
   .map(([e, {width, height}]) => `${width}x${height} ${e.outerHTML.slice(0, 80)}`)"""
+THEMES: tuple[Literal["dark", "light"], ...] = ("light", "dark")
+GROUNDS = {"dark": (14, 17, 22), "light": (238, 240, 243)}
 TABS = ("Findings", "Robots", "Tools", "Time", "Map")
 
 
@@ -42,12 +50,26 @@ def fresh(chromium: Browser, room: Room) -> Console:
     ("size", "least"), LEAST_SHARES, ids=lambda each: str(each.get("width", "")) if isinstance(each, dict) else ""
 )
 def test_the_map_has_most_of_the_screen_and_nothing_is_cut_off(
-    fresh: Console, size: ViewportSize, least: float
+    fresh: Console, size: ViewportSize, least: float, tmp_path: Path
 ) -> None:
     fresh.page.set_viewport_size(size)
     fresh.settled()
     assert fresh.page.evaluate(SHARE) >= least
     assert fresh.page.evaluate(OVERFLOWING) == []
+    bright = []
+    for theme in THEMES:
+        fresh.page.emulate_media(color_scheme=theme)
+        fresh.tell("c.theme()")
+        fresh.settled()
+        path = tmp_path / f"first-{size['width']}-{theme}.png"
+        fresh.page.screenshot(path=path)
+        picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        assert picture is not None
+        bright.append(picture.mean())
+        drawn = fresh.picture()
+        assert drawn.std() > 8, f"{theme}: the map is in the picture"
+        assert np.abs(drawn[-2, 2].astype(int) - GROUNDS[theme]).max() <= 1, "around it is the page's ground"
+    assert bright[0] > bright[1] + 60, "light is light"
 
 
 @pytest.mark.parametrize("size", [PHONE, PHONE_ASIDE], ids=["upright", "aside"])

@@ -196,6 +196,15 @@ def test_shape_is_seen_without_colour(console: Console) -> None:
     light = shaded.sum(axis=2) / np.maximum(plain.sum(axis=2, dtype=float), 1)
     drawn = np.abs(plain.astype(int) - GROUND).max(axis=2) > 40
     assert np.median(light[drawn]) > 0.95, "most of the picture is as bright as it was"
+    # In motion one pixel's light counts for four: edges are as dark, and flat faces as bright, but for their rims.
+    console.tell("(c.stage.restsMs = performance.now() + 4000, c.stage.draw())")
+    frames = console.tell("c.stage.frames")
+    console.until(f"c.stage.frames > {frames}", "a frame in motion")
+    moving = console.picture().sum(axis=2) / np.maximum(plain.sum(axis=2, dtype=float), 1)
+    console.tell("(c.stage.restsMs = 0, c.stage.draw())")
+    assert np.mean(np.abs(moving - light)[drawn] < 0.05) > 0.8
+    assert moving[drawn].mean() == pytest.approx(light[drawn].mean(), abs=0.02)
+    assert np.mean(moving[drawn] < 0.6) > 0.5 * np.mean(light[drawn] < 0.6)
     steps_m = []
     for which in (drawn & (light < 0.6), drawn & (light > 0.98)):
         places = np.argwhere(which)[:, ::-1]

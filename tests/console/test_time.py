@@ -11,7 +11,7 @@ import numpy.typing as npt
 import pytest
 from playwright.sync_api import Browser
 from tests.console.browsing import Console, map_tab, serious
-from tests.console.past_map import BEFORE_S, CHANGED, EPOCH_S, GEOMETRY, OUT, SIGHTS, Sight, at
+from tests.console.past_map import BEFORE_S, CHANGED, EPOCH_S, GEOMETRY, OUT, SIGHTS, START_S, Sight, at
 from tests.console.room import Room
 from tests.fixtures.server.live import until
 from tests.fixtures.server.pushes import MOLE
@@ -30,6 +30,8 @@ LOGS = 200
 NOTE = "the head was knocked"
 SHOWN = "[...c.cells.all.values()].filter(({ count }) => count).map(({ key, bytes }) => [key, [...bytes]])"
 STRIDE = 12
+ROOM, FAR = 0.8, 6
+"""Part of the map that has room: less than all at voxels, more than the first of its moments, so many steps back."""
 Nodes = dict[str, npt.NDArray[np.int64]]
 
 
@@ -120,12 +122,35 @@ def test_a_moment_seen_before_asks_the_server_for_nothing(console: Console) -> N
     for key in (",", ",", ",", ".", ".", "."):
         page.keyboard.press(key)
         console.settled()
+        console.until("!c.time.isLookingAhead", "what would come next is there, too")
     assert console.tell("c.look.atS") is None
     console.requests.clear()
     for key in (",", ",", ",", ".", ".", "."):
         page.keyboard.press(key)
         assert console.tell("c.cells.waiting") == 0, "it is there at once"
     assert [url for url in console.requests if "/main/cells" in url] == []
+
+
+def test_one_plan_of_depths_counts_for_all_moments_while_the_eye_rests(console: Console) -> None:
+    budget, whole = console.tell("[c.cells.budget, c.cells.drawn]")
+    console.tell("(c.cells.budget = a[0], c.replan())", int(ROOM * whole))
+    console.settled()
+    depths = "[...c.cells.all.values()].map(({ depth }) => depth)"
+    coarse = console.tell(depths)
+    assert max(coarse) < GEOMETRY.depth, "voxels have no room"
+    for by in (-FAR, FAR):
+        console.tell("c.time.step(a[0])", by)
+        console.settled()
+        console.until("!c.time.isLookingAhead", "what would come next is there, too")
+        assert console.tell(depths) == coarse, "though there was room for the voxels of the beginning"
+    console.requests.clear()
+    for by in (-FAR, FAR):
+        console.tell("c.time.step(a[0])", by)
+        assert console.tell("c.cells.waiting") == 0, "it is there at once"
+    assert [url for url in console.requests if "/main/cells" in url] == []
+    console.tell("(c.cells.budget = a[0], c.replan())", budget)
+    console.settled()
+    assert console.tell("c.cells.drawn") == whole
 
 
 def test_a_link_shows_the_same_moment_and_a_reload_stays_there(console: Console) -> None:
@@ -148,6 +173,22 @@ def test_a_link_shows_the_same_moment_and_a_reload_stays_there(console: Console)
     assert all((reloaded[key] == shown[key]).all() for key in shown)
     console.tell("c.time.show(null)")
     console.settled()
+
+
+def test_times_are_those_of_a_zone_that_is_chosen_once(console: Console) -> None:
+    page = console.page
+    zone = page.get_by_role("region", name="Map").get_by_label("times in")
+    assert zone.input_value() == "UTC"
+    for name, hour in (("Asia/Tokyo", "17:5"), ("UTC", "08:5")):
+        with page.expect_event("load"):
+            zone.select_option(name)
+        console.until("c.time.timeline.moments.length", "the page is there again")
+        console.settled()
+        console.tell("c.time.show(a[0])", START_S)
+        said = page.locator(".moment")
+        said.get_by_text("as it was by").wait_for()
+        assert re.search(rf"2025-10-09 {hour}\d:00 ({name}|GMT\+9)", said.inner_text())
+        console.tell("c.time.show(null)")
 
 
 def test_the_axis_is_scrubbed_by_pointer_and_by_keys(console: Console) -> None:

@@ -2,8 +2,10 @@
 
 import { readFileSync } from "node:fs";
 import { classColours, classOf, unsureColour } from "../src/class_colours.ts";
-import { fromHash } from "../src/look.ts";
-import type { LogEntry } from "../src/messages.ts";
+import type { Finding } from "../src/findings.ts";
+import { fromHash, POINTS_MAX, toHash } from "../src/look.ts";
+import type { LiveEvent, LogEntry } from "../src/messages.ts";
+import { NewsBook } from "../src/news.ts";
 import { sizeOf } from "../src/picture_size.ts";
 import { HELD_MAX, Timeline } from "../src/timeline.ts";
 
@@ -61,6 +63,44 @@ for (const text of ["1e20", "-1e20", "1e12", "NaN", "Infinity", ""]) {
   law(`#at=${text} is no time`, text === "" || (look.atS === null && look.sinceS === null));
 }
 law("a time of this century is one", fromHash("#map=a&at=1760000040.5").look.atS === 1760000040.5);
+
+const points = (count: number) => Array.from({ length: count }, (_, n) => [n, -n / 8, 0.125] as [number, number, number]);
+for (const count of [0, 1, 3, POINTS_MAX]) {
+  const { look } = fromHash("#map=a");
+  look.points = points(count);
+  law("an address has all points of a measure", JSON.stringify(fromHash(toHash("a", look, null)).look.points) === JSON.stringify(points(count)));
+}
+for (const text of ["1,2", "1,2,x", "1,2,NaN", "1,2,1e999", points(POINTS_MAX + 1).flat().join()]) law(`points=${text} are none`, fromHash(`#map=a&points=${text}`).look.points.length === 0);
+
+const news = new NewsBook();
+const hear = (event: object) => news.hear(event as LiveEvent);
+const texts = () => news.items.map(({ text }) => text).join("; ");
+const sign = (branch: string, note: string, gone = false) => ({ branch, gone, status: { note, pose: null } });
+hear({ type: "hello", robots: [sign("r", "maps")] });
+hear({ type: "robot", robot: sign("r", "still maps") });
+law("who is there already, and goes on, is no news", texts() === "");
+hear({ type: "robot", robot: sign("r", "stuck at stairs") });
+hear({ type: "robot", robot: sign("r", "stuck at stairs") });
+hear({ type: "robot", robot: sign("q", "") });
+hear({ type: "robot", robot: sign("q", "", true) });
+law("who joins, leaves or needs help is news, once", texts() === "q left the team; q joined; r: stuck at stairs");
+hear({ type: "log", entries: [{ ...entry(1, 1), cells: 3 }, { ...entry(2, null) }] });
+hear({ type: "log", entries: [{ ...entry(3, 3), cells: 2 }] });
+law("commits of a robot in a row are one line, and what has no cells none", texts().startsWith("r mapped: 2 commits, 5 cells; q left"));
+hear({ type: "log", entries: [{ ...entry(4, 3), kind: "-" }] });
+law("what is taken out is news", texts().startsWith("A commit of r was taken out; r mapped"));
+const hot = (...places: number[]) => places.map((x) => ({ id: `spot ${x}`, state: "new", spot: {}, celsius: 40, place: [x, 0, 0] }) as unknown as Finding);
+const before = news.items.length;
+news.look(hot(1), true);
+news.look(hot(1.3), true);
+law("a hot spot that was there, or moved a little, is no news", news.items.length === before);
+news.look(hot(1.3, 5), true);
+law("another one is, with its place", news.items[0]?.text === "New hot spot, 40.0 °C" && news.items[0]?.find === "spot 5");
+news.look(hot(1.3, 5, 9), false);
+news.look(hot(1.3, 5, 9), true);
+law("a list of another threshold is no news", news.items.length === before + 1);
+for (let n = 0; n < 100; n++) hear({ type: "robot", robot: sign(`s${n}`, "") });
+law("news are bounded", news.items.length === 50);
 
 const classes = classColours(64);
 law("a class is told by its colour, and by its paler one", classes.every((colour, n) => classOf(colour, 64)?.number === n && classOf(unsureColour(colour), 64)?.number === n));

@@ -58,6 +58,7 @@ export class Appearance {
     else uniforms.uBand.value.set(1, 0);
     this.cells.setMaterial(look.boxes ? boxes : squares);
     this.refreshRange(robots);
+    this.stage.draw();
   }
 
   /** Ends of the palette as locked, or as what is shown has them. */
@@ -68,9 +69,11 @@ export class Appearance {
     const found = look.field === "colour" || look.field === "robot" ? null
       : (this.spread.range(look.field) ?? rangeOf(this.cells, look.field, uLow.value.z, uHigh.value.z));
     const range = look.ranges[look.field] ?? (found && (found.map((end) => end - zero) as [number, number]));
+    const before = uRange.value.toArray();
     if (range) uRange.value.set(range[0] + zero, range[1] + zero);
     this.legend.show(look, range, { robots, classes: this.classes }, this.told(range), this.valuesOf(zero));
-    this.stage.draw();
+    // A frame takes the time of many ticks where there is no graphics card.
+    if (look.field === "age" || look.field === "robot" || uRange.value.toArray().some((end, n) => end !== before[n])) this.stage.draw();
   }
 
   /** The map's values in the look's unit; heights over the floor. */
@@ -88,9 +91,10 @@ export class Appearance {
     const { head, all } = this.cells;
     const asks = this.look.field === "age" || this.look.field === "robot";
     const isShort = asks && [...all.values()].some(({ points, lm }) => points && this.book.isBefore(lm));
-    const log = !isShort ? "whole" : this.book.isReading ? "read" : "short";
-    if (this.book.ageS(head) === null) return { unit: "log entries", size: 1, log };
-    return { ...ageUnit(range?.[1] ?? 0), log };
+    const log: Told["log"] = !isShort ? "whole" : this.book.isReading ? "read" : "short";
+    const known = { log, newestS: this.book.newestS || null, cellM: this.cells.edgeM };
+    if (this.book.ageS(head) === null) return { unit: "log entries", size: 1, ...known };
+    return { ...ageUnit(range?.[1] ?? 0), ...known };
   }
 
   /** What a floor plan is drawn with: the same field, and the ends of the whole map's temperatures. */

@@ -9,6 +9,7 @@ import { FindingsDesk } from "./findings_desk.ts";
 import { Heights } from "./heights.ts";
 import { KeptAddress } from "./kept_address.ts";
 import { LogBook } from "./log_book.ts";
+import { NewsBook, type NewsItem } from "./news.ts";
 import { fieldsOf, toHash, type CameraView, type Field, type Look } from "./look.ts";
 import { MapFeed } from "./map_feed.ts";
 import type { MapInfo, Triple } from "./messages.ts";
@@ -31,6 +32,7 @@ import { DutyPanel } from "./ui/duty_panel.ts";
 import { LookPanel } from "./ui/look_panel.ts";
 import { mapFacts } from "./ui/map_facts.ts";
 import { MeasurePanel } from "./ui/measure_panel.ts";
+import { NewsPanel } from "./ui/news_panel.ts";
 import { PlanPanel } from "./ui/plan_panel.ts";
 import { ReferenceFrame } from "./ui/reference_frame.ts";
 import { Shelf } from "./ui/shelf.ts";
@@ -74,6 +76,8 @@ export class Console {
   readonly shelf: Shelf;
   readonly plan: PlanPanel;
   private readonly dutyPanel = new DutyPanel();
+  readonly news = new NewsBook();
+  private readonly newsPanel = new NewsPanel();
   private readonly takeAway: TakeAwayPanel;
   private readonly grid = new CellGrid();
   /** Cells that changed since the robot that is followed fetched last. */
@@ -103,7 +107,7 @@ export class Console {
     this.takeAway = new TakeAwayPanel(api, info, look);
     this.panel = new LookPanel(look);
     this.cells = new Cells(api, info);
-    this.measure = new MeasurePanel(this.cells, info.geometry.voxel_edge_um / 1e6);
+    this.measure = new MeasurePanel(this.cells, look, info.geometry.voxel_edge_um / 1e6);
     this.empty = emptyMap(info.name);
     this.empty.hidden = true;
     const view = h("main", { class: "view" }, host, this.empty, this.labels, this.measure.words, h("div", { class: "notes" }, this.flag, this.chips.element));
@@ -146,7 +150,7 @@ export class Console {
     });
     this.stage.add(this.findings.pins.group);
     view.append(this.findings.pins.element, this.findings.alarm.banner);
-    left.append(this.dutyPanel.element, this.findings.panel.element, this.camera.element, this.team.panel.element, mapFacts(info));
+    left.append(this.dutyPanel.element, this.findings.panel.element, this.newsPanel.element, this.camera.element, this.team.panel.element, mapFacts(info));
     this.appearance = new Appearance(info, look, this.stage, this.cells, this.book, this.spread);
     view.append(this.appearance.legend.element);
     this.plan = new PlanPanel(this.stage, this.cells, this.heights, {
@@ -155,7 +159,7 @@ export class Console {
     });
     view.append(this.plan.small, this.plan.element);
     this.connect(onRefused);
-    this.feed = new MapFeed(api, info, { cells: this.cells, book: this.book, strip: this.strip, team: this.team, findings: this.findings }, {
+    this.feed = new MapFeed(api, info, { cells: this.cells, book: this.book, strip: this.strip, team: this.team, findings: this.findings, news: this.news }, {
       plan: () => this.replan(), refuse: onRefused,
       show: () => {
         this.moved = true;
@@ -197,6 +201,7 @@ export class Console {
       this.stage.place(camera);
       this.camera.isPlaced = true;
     }
+    this.measure.follow();
     this.kept.followed();
     this.apply();
   }
@@ -248,7 +253,7 @@ export class Console {
 
   /** The address that shows the same. */
   get address(): string {
-    return new URL(toHash(this.info.name, this.look, this.stage.view), document.baseURI).href;
+    return new URL(toHash(this.info.name, this.look, this.stage.view, this.findings.chosen), document.baseURI).href;
   }
 
   say(text: string): void {
@@ -288,6 +293,12 @@ export class Console {
     const awayM = Math.min(Math.max(back.length() / 3, NEAR_M), back.length());
     this.team.follow(null);
     this.stage.fly({ eye: point.clone().addScaledVector(back.normalize(), awayM).toArray() as Triple, target: point.toArray() as Triple });
+  }
+
+  /** Fly to what a line of news is about: to its finding while there is one, else over its place. */
+  private goToNews({ find, place }: NewsItem): void {
+    if (find && this.findings.all.some(({ id }) => id === find)) this.findings.fly(find);
+    else if (place) this.camera.over(place);
   }
 
   /** Turn: the head of who walks, or the picture around what is looked at. */
@@ -380,6 +391,7 @@ export class Console {
       else delete this.look.ranges[this.look.field];
       this.apply();
     };
+    this.newsPanel.onGo = (item) => this.goToNews(item);
     this.dutyPanel.onAsking = (asking) => openAsking(this.duties, asking);
     this.dutyPanel.onFull = (robot) => openFull(this.api, this.info.name, this.duties, robot);
     this.team.onFollow = () => this.stage.draw();
@@ -423,6 +435,9 @@ export class Console {
     this.feed.tick();
     this.duties.tick();
     this.findings.tick();
+    this.measure.tick();
+    this.news.look(this.findings.all, this.findings.spots.isWhole);
+    this.newsPanel.show(this.news.items);
     this.dutyPanel.show(this.duties);
     this.plan.tick();
     this.shelf.count("findings", this.findings.fresh ? `· ${this.findings.fresh} new` : "");

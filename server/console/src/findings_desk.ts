@@ -53,7 +53,7 @@ export class FindingsDesk {
   readonly spots: HotSpotList;
   all: readonly Finding[] = [];
   isMarking = false;
-  private chosen: string | null = null;
+  chosen: string | null = null;
   /** A flight whose end is still to be looked at. */
   private flight: { place: Vector3; witness: Vector3 | null; left: number } | null = null;
   /** What a link names, until it is there. */
@@ -118,6 +118,12 @@ export class FindingsDesk {
     this.find();
   }
 
+  /** Choose a finding where one is: a reload, or Back; null: none. */
+  choose(id: string | null): void {
+    this.chosen = id;
+    this.update();
+  }
+
   /** Fly to the finding that a link names, as soon as it is known. */
   seek(id: string): void {
     this.sought = { id, endMs: performance.now() + SEEK_MS };
@@ -166,8 +172,7 @@ export class FindingsDesk {
   forget(): void {
     this.stopMarking();
     this.flight = null;
-    this.chosen = null;
-    this.update();
+    this.choose(null);
   }
 
   dispose(): void {
@@ -190,8 +195,6 @@ export class FindingsDesk {
   fly(id: string): void {
     const found = this.all.find((one) => one.id === id);
     if (!found) return;
-    this.chosen = id;
-    this.update();
     const place = new Vector3(...found.place);
     const where = `Finding ${found.number}: ${found.celsius === null ? found.title : `${found.celsius.toFixed(1)} °C`} at ${place.toArray().map((value) => value.toFixed(2)).join(", ")} m`;
     const hidden = !isShown(place);
@@ -203,13 +206,14 @@ export class FindingsDesk {
     }
     const from = found.spot?.commit ? this.acts.witness(found.spot.commit) : null;
     this.flight = { place, witness: from && new Vector3(...from), left: FLIGHTS_MAX };
-    this.go(this.flight);
+    this.acts.fly(this.view(this.flight));
+    this.choose(id); // after the flight began: Back leads to where it was not chosen
     this.acts.say(hidden ? `${where}. It was cut off: all heights are shown now.` : where);
   }
 
-  private go(flight: { place: Vector3; witness: Vector3 | null; left: number }): void {
+  private view(flight: { place: Vector3; witness: Vector3 | null; left: number }): CameraView {
     flight.left--;
-    this.acts.fly(visibleFrom(this.cells, flight.place, this.stage.camera.position, flight.witness));
+    return visibleFrom(this.cells, flight.place, this.stage.camera.position, flight.witness);
   }
 
   /** Where a flight has ended and finer voxels have come, look whether they hide what it was for, and go elsewhere then. */
@@ -224,7 +228,7 @@ export class FindingsDesk {
     const met = this.picker.at(clientWidth / 2, clientHeight / 2);
     const nearM = (NEAR_VOXELS * this.info.geometry.voxel_edge_um) / 1e6;
     if (!met || met.point.distanceTo(flight.place) <= Math.max(nearM, met.edgeM)) this.flight = null;
-    else this.go(flight);
+    else this.stage.flyOn(this.view(flight));
   }
 
   private async act(act: Act, id: string): Promise<void> {

@@ -18,6 +18,8 @@ export class HotSpotList {
   spots: readonly HotSpot[] = [];
   /** Of which these are the first. */
   total = 0;
+  /** All of the map was looked through for what is above the threshold. */
+  isWhole = false;
   /** Why there is no list, or not all of it; empty: there is. */
   said = "";
   private overC: number;
@@ -46,6 +48,7 @@ export class HotSpotList {
   setThreshold(overC: number): void {
     if (overC === this.overC) return;
     this.overC = overC;
+    this.isWhole = false;
     this.askAtMs = 0;
   }
 
@@ -67,6 +70,7 @@ export class HotSpotList {
       const found = await this.api.json<HotSpots>(`maps/${this.map}/main/hotspots?over_k=${overK}&count=${COUNT}`);
       this.spots = found.spots;
       this.total = found.total;
+      this.isWhole = found.complete && overC === this.overC;
       this.said = found.complete ? "" : "The server is still looking through the map.";
       this.tries = found.complete ? 0 : this.tries + 1;
       if (!found.complete && this.tries < TRIES) this.askAtMs = this.nextMs;

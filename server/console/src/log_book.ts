@@ -37,7 +37,8 @@ export class LogBook {
   private readonly known = new Map<number, Known>();
   /** Rising in number; only of entries that state a time. */
   private timed: { seq: number; timeS: number }[] = [];
-  private newestS = 0;
+  /** Time of the newest measurement, s; 0: none states one. */
+  newestS = 0;
   /** Oldest entry of the run without a gap that ends at the newest one; 0: none is known. */
   private firstSeq = 0;
   private newestSeq = 0;

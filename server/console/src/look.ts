@@ -50,6 +50,8 @@ export interface Look {
   atS: number | null;
   /** Time with which that is compared; null: nothing is compared. */
   sinceS: number | null;
+  /** Points that were measured, m in the map. */
+  points: Triple[];
 }
 
 export interface CameraView {
@@ -60,17 +62,20 @@ export interface CameraView {
 export function defaultLook(): Look {
   return {
     field: "colour", ranges: {}, floorM: null, ceilingM: null, isCeilingChosen: false, clip: null, minP: 0, band: null,
-    cells: false, boxes: null, atS: null, sinceS: null,
+    cells: false, boxes: null, atS: null, sinceS: null, points: [],
   };
 }
 
 /** Findings as addresses name them: a mark by its key, a hot spot by its hottest voxel. */
 const FIND = /^(mark [a-z0-9._-]+:\d+|spot -?\d+,-?\d+,-?\d+)$/;
 
+/** Points of a measure at most: addresses stay short enough to be sent. */
+export const POINTS_MAX = 50;
+
 /** Times beyond this are none: a date of the page's clock ends at 8.64e12 s; s from 1970. */
 const TIME_MAX_S = 1e11;
 
-/** The part of an address behind #; `find`: the finding that it leads to. */
+/** The part of an address behind #; `find`: the finding that it leads to, or with a camera the one that is chosen there. */
 export function toHash(map: string, look: Look, camera: CameraView | null, find: string | null = null): string {
   const parts: [string, string][] = [["map", map]];
   const add = (name: string, value: string | null) => value !== null && parts.push([name, value]);
@@ -85,18 +90,25 @@ export function toHash(map: string, look: Look, camera: CameraView | null, find:
   add("cells", look.cells ? "1" : null);
   add("at", look.atS === null ? null : String(look.atS));
   add("since", look.sinceS === null ? null : String(look.sinceS));
+  add("points", look.points.length ? numbers(look.points.flat(), 3) : null);
   add("eye", camera && numbers(camera.eye));
   add("target", camera && numbers(camera.target));
   add("find", find && find.replace(" ", "+"));
   return "#" + parts.map(([name, value]) => `${name}=${value}`).join("&");
 }
 
+/** Numbers of a list; none, unless each is one. */
+function numbersOf(text: string | undefined): number[] {
+  const found = text ? text.split(",").map(Number) : [];
+  return found.every(Number.isFinite) ? found : [];
+}
+
 export function fromHash(hash: string): { map: string | null; look: Look; camera: CameraView | null; find: string | null } {
   const given = new Map(hash.replace(/^#/, "").split("&").map((part) => part.split("=", 2) as [string, string]));
   const look = defaultLook();
   const numbers = (name: string, count: number): number[] | null => {
-    const found = (given.get(name) ?? "").split(",").map(Number);
-    return given.has(name) && found.length === count && found.every(Number.isFinite) ? found : null;
+    const found = numbersOf(given.get(name));
+    return found.length === count ? found : null;
   };
   const one = (name: string) => numbers(name, 1)?.[0] ?? null;
   look.field = FIELDS.find(({ field }) => field === given.get("by"))?.field ?? "colour";
@@ -122,6 +134,8 @@ export function fromHash(hash: string): { map: string | null; look: Look; camera
   };
   look.atS = time("at");
   look.sinceS = time("since");
+  const points = numbersOf(given.get("points"));
+  if (points.length % 3 === 0 && points.length <= 3 * POINTS_MAX) for (let n = 0; n < points.length; n += 3) look.points.push(points.slice(n, n + 3) as Triple);
   const eye = numbers("eye", 3) as Triple | null;
   const target = numbers("target", 3) as Triple | null;
   const map = given.get("map") ?? null;

@@ -69,7 +69,8 @@ function show(maps: MapInfo[], info: MapInfo): void {
   // Many requests may be refused at once; the first one asks who is there.
   const refused = () => mine === starts && again("You are logged out: this token ended, or was revoked. With another one the page goes on where it was.");
   open = new Console(api, info, look, camera, bar, refused);
-  if (find) open.findings.seek(find);
+  if (camera) open.findings.choose(find);
+  else if (find) open.findings.seek(find);
   if (new URLSearchParams(location.search).has("test")) Object.assign(window, { cairn: { api, console: open } });
 }
 
@@ -122,11 +123,10 @@ listen(keys);
 // A shared link that is opened where the page already is, or Back after a flight.
 function follow(): void {
   const { map, look, camera, find } = fromHash(location.hash);
-  if (open && open.name === map && find) {
-    open.take(look, camera);
-    open.findings.seek(find);
-  } else if (open && open.name === map && camera) open.take(look, camera);
-  else void start();
+  if (!open || open.name !== map || !(find || camera)) return void start();
+  open.take(look, camera);
+  if (camera) open.findings.choose(find);
+  else if (find) open.findings.seek(find);
 }
 window.addEventListener("hashchange", follow);
 // Back right after a flight leads to the address that is still kept, which is no change of it.

@@ -8,6 +8,7 @@ import type { FindingsDesk } from "./findings_desk.ts";
 import { LiveLink, type LinkState } from "./live.ts";
 import type { LogBook } from "./log_book.ts";
 import type { LiveEvent, MapInfo } from "./messages.ts";
+import type { NewsBook } from "./news.ts";
 import type { Cells } from "./scene/cells.ts";
 import { serverNowS } from "./server_time.ts";
 import type { Team } from "./team.ts";
@@ -23,6 +24,7 @@ export interface FeedTakers {
   readonly strip: CommitStrip;
   readonly team: Team;
   readonly findings: FindingsDesk;
+  readonly news: NewsBook;
 }
 
 export interface FeedActs {
@@ -84,8 +86,9 @@ export class MapFeed {
   }
 
   private heard(event: LiveEvent): void {
-    const { cells, book, strip, team, findings } = this.takers;
+    const { cells, book, strip, team, findings, news } = this.takers;
     findings.hear(event);
+    news.hear(event);
     if (event.type === "hello") {
       team.greet(event.robots);
       if (!event.resumed) void this.loading.then(() => (this.cursor === event.cursor ? undefined : this.reloadAll()));

@@ -32,6 +32,9 @@ export class TimeDesk {
   private isReading = false;
   /** A handle that is dragged moves more often than frames are drawn. */
   private wanted: { handle: number; atS: number | null } | null = null;
+  /** Who steps goes on that way: what comes next is fetched before it is asked for. `undefined`: nothing is to be. */
+  private ahead: { atS: number | null } | undefined;
+  isLookingAhead = false;
   private readonly api: Api;
   private readonly info: MapInfo;
   private readonly look: Look;
@@ -100,8 +103,10 @@ export class TimeDesk {
   step(by: number, handle = Infinity): void {
     const isFirst = handle === 0 && this.look.sinceS !== null;
     const next = this.next(isFirst ? this.look.sinceS : this.look.atS, by);
-    if (isFirst) this.since(next);
-    else this.show(next);
+    if (isFirst) return this.since(next);
+    this.show(next);
+    this.isLookingAhead = Number.isFinite(by) && (next !== null || by < 0);
+    this.ahead = this.isLookingAhead ? { atS: this.next(next, by) } : undefined;
   }
 
   /** Moment so many further on; null: now. */
@@ -128,6 +133,18 @@ export class TimeDesk {
   tick(): void {
     this.tell();
     this.comparison.tick();
+    if (this.ahead && !this.cells.waiting && !this.cells.needsPlan) void this.lookAhead(this.ahead.atS);
+  }
+
+  private async lookAhead(atS: number | null): Promise<void> {
+    this.ahead = undefined;
+    try {
+      await this.cells.lookAhead(atS === null ? null : this.timeline.momentAt(atS));
+    } catch {
+      // Whoever goes there hears why it is not known.
+    } finally {
+      this.isLookingAhead = this.ahead !== undefined;
+    }
   }
 
   dispose(): void {

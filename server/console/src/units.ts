@@ -1,5 +1,7 @@
 /** Numbers as people read them, always with a unit. */
 
+import { pageZone } from "./zone.ts";
+
 export const KELVIN_ZERO_C = 273.15;
 
 export function celsius(kelvin: number, digits = 1): string {
@@ -31,13 +33,14 @@ export function ago(seconds: number): string {
   return `${Math.floor(seconds)} s ago`;
 }
 
+/** Day and time, with the name of the page's zone. */
 export function clock(timeS: number): string {
-  return new Date(timeS * 1000).toISOString().replace("T", " ").slice(0, 19) + " UTC";
+  return pageZone().format(timeS);
 }
 
 /** The time of day, with the day where the day begins. */
 export function clockTime(timeS: number): string {
-  const text = new Date(timeS * 1000).toISOString();
+  const text = clock(timeS);
   return text.slice(11, 19) === "00:00:00" ? text.slice(0, 10) : text.slice(11, 19).replace(/:00$/, "");
 }
 

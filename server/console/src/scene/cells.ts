@@ -48,6 +48,9 @@ export class Cells {
   private readonly api: Api;
   private readonly map: string;
   private planned = false;
+  /** View of the last plan, and that for which depths stay as they are at whatever moment; empty: none. */
+  private view = "";
+  private settledView = "";
   private ready = NONE_READY;
   /** Moment that is shown, or on its way; null: now. */
   private moment: Moment | null = null;
@@ -71,6 +74,7 @@ export class Cells {
   /** Take over the whole index: what differs from what is shown is taken from `ready` or fetched, what is gone goes. */
   takeIndex(entries: readonly CellEntry[], ready: ReadyViews): void {
     this.ready = ready;
+    this.settledView = "";
     const there = new Set<string>();
     // Entries of another log may have the same numbers.
     this.past.forget();
@@ -104,12 +108,15 @@ export class Cells {
     shown.digest = "";
     shown.dirty = true;
     this.head = Math.max(this.head, lm);
+    this.settledView = "";
     this.planned = false;
   }
 
   /** Show the map as it was at a moment; null: as it is. What was shown before is kept, so the way back is short. */
   showMoment(moment: Moment | null): void {
     if (moment?.key === this.moment?.key) return;
+    // One plan for all moments: of two, each moment would want some cells at depths that it was not seen at before.
+    if (this.planned && !this.waiting) this.settledView = this.view;
     if (!this.moment) {
       for (const cell of this.all.values()) {
         // Of a busy cell that changed the old bytes are still shown: under the name of its new state they would come back as now.
@@ -134,6 +141,19 @@ export class Cells {
     }
     this.planned = false;
     this.onChange(true);
+  }
+
+  /** Fetch what another moment shows, cell by cell, until a third one is turned to; null: now. */
+  async lookAhead(moment: Moment | null): Promise<void> {
+    const { turns } = this;
+    for (const cell of [...this.all.values()]) {
+      const depth = cell.depth || cell.wanted;
+      const name: [string, string] = [`${cell.key}/${depth}`, `${cell.lm}/${moment?.key ?? ""}`];
+      if (!depth || this.past.has(...name)) continue;
+      const { data } = await this.api.view(this.map, cell.key, depth, { etag: null, atS: moment?.atS ?? null });
+      if (data) this.past.put(...name, await this.decoders.decode(data));
+      if (turns !== this.turns) return;
+    }
   }
 
   /** Key of the moment that is shown; empty: now. */
@@ -184,6 +204,14 @@ export class Cells {
 
   /** Choose depths for where the eye is, and fetch what is missing. */
   update(camera: PerspectiveCamera, heightPx: number, frustum: { intersectsBox(box: Box3): boolean }): void {
+    this.view = JSON.stringify([camera.matrixWorld.elements, camera.projectionMatrix.elements, heightPx, this.budget]);
+    if (this.view !== this.settledView) this.choose(camera, heightPx, frustum);
+    this.planned = true;
+    this.fetchMore();
+  }
+
+  private choose(camera: PerspectiveCamera, heightPx: number, frustum: { intersectsBox(box: Box3): boolean }): void {
+    this.settledView = "";
     const cells = [...this.all.values()];
     const pxPerRad = heightPx / (2 * Math.tan((camera.fov * Math.PI) / 360));
     const candidates = cells.map((cell) => {
@@ -198,8 +226,6 @@ export class Cells {
     });
     const largest = cells.map((_, n) => n).sort((a, b) => candidates[b].sizePx - candidates[a].sizePx);
     this.queue = largest.map((n) => cells[n]);
-    this.planned = true;
-    this.fetchMore();
   }
 
   private queue: ShownCell[] = [];
@@ -363,6 +389,7 @@ export class Cells {
   }
 
   private remove(cell: ShownCell): void {
+    this.settledView = "";
     cell.drop();
     if (this.all.delete(cell.key)) this.free.push(cell.number);
   }

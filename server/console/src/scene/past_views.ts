@@ -12,6 +12,10 @@ export class PastViews {
   private readonly shares = new Map<Uint8Array, number>();
   private sizeBytes = 0;
 
+  has(place: string, state: string): boolean {
+    return this.views.has(`${place}/${state}`);
+  }
+
   get(place: string, state: string): Uint8Array | undefined {
     const name = `${place}/${state}`;
     const found = this.views.get(name);

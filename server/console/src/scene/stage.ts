@@ -135,7 +135,7 @@ export class Stage {
     this.moves();
   }
 
-  /** Without a graphics card the picture is shaded only once the eye rests: a half of a frame's time. */
+  /** Without a graphics card the picture is shaded finely only once the eye rests: a half of a frame's time. */
   get isMoving(): boolean {
     return this.isSoftware && performance.now() < this.restsMs;
   }
@@ -154,6 +154,11 @@ export class Stage {
   /** Bring the eye somewhere, so that people see how they got there. */
   fly(to: CameraView): void {
     this.onFly();
+    this.flyOn(to);
+  }
+
+  /** Bring it on from there: no flight of its own for those who go back. */
+  flyOn(to: CameraView): void {
     if (matchMedia("(prefers-reduced-motion: reduce)").matches || this.isSoftware) return this.place(to);
     this.flight = { from: this.view, to, startMs: performance.now() };
     this.draw();
@@ -229,7 +234,7 @@ export class Stage {
     const { width, height } = this.canvas;
     uniforms.uViewport.value.set(0, 0, width, height);
     uniforms.uNearFar.value.set(this.camera.near, this.camera.far);
-    this.dome.render(this.renderer, this.voxels, this.overlays, this.camera, !this.isMoving);
+    this.dome.render(this.renderer, this.voxels, this.overlays, this.camera, this.isMoving);
     if (this.isMoving) this.drawAtRest();
     this.frames++;
     if (again || this.flight) this.draw();

@@ -6,7 +6,7 @@ import { KEPT } from "../log_book.ts";
 import { FIELDS, type Field, type Look } from "../look.ts";
 import { OVER, robotColour, stopsOf, UNDER } from "../palettes.ts";
 import { SLOPE_MAX_DEG, STEP_MAX_M } from "../scene/ground.ts";
-import { thousands } from "../units.ts";
+import { clock, metres, thousands } from "../units.ts";
 
 /** Names that colours stand for: of robots, and of classes where the map counts them. */
 export interface Names {
@@ -20,6 +20,10 @@ export interface Told {
   readonly size: number;
   /** To all that is shown; not yet; or not so far. */
   readonly log: "whole" | "read" | "short";
+  /** Of all that is known, s; null: no entry states a time. */
+  readonly newestS: number | null;
+  /** Edge of the cells, by which ages and robots are known, m. */
+  readonly cellM: number;
 }
 
 /** Values of the whole map in the look's unit; `shift`: what is told as 0. */
@@ -57,7 +61,7 @@ export class Legend {
     this.locked = locked;
     const { label, palette } = FIELDS.find(({ field }) => field === look.field)!;
     const bare = h("p", { class: "bare" }, h("span", { class: "flat", "aria-hidden": "true" }), bareText(look.field, told, classes.length > 0));
-    if (look.field === "robot") return fill(this.element, h("h2", {}, "Robot that added to the cell last"), ...robots.map((name) => named(name, robots)), bare);
+    if (look.field === "robot") return fill(this.element, h("h2", {}, "Robot that added to the cell last"), ...robots.map((name) => named(name, robots)), byCell(told), bare);
     if (look.field === "colour" && classes.length) return fill(this.element, h("h2", {}, "Class with the most votes"), ...classList(classes), bare);
     if (!palette) return fill(this.element, h("h2", {}, label), h("p", {}, "As the cameras saw it."), bare);
     if (!range) return fill(this.element, h("h2", {}, label), h("p", {}, `Nothing shown has a ${label.toLowerCase()}.`), bare);
@@ -66,6 +70,7 @@ export class Legend {
       this.element, h("h2", {}, titleOf(look.field, told, values)), values.histogram && bars(values.histogram, range, openEnds(look.field, range, values)),
       bar(stopsOf(palette), openEnds(look.field, range, values), isAge), this.ends(look.field, range, told, values),
       ...beyond(look.field, range, values), look.field === "temperature" || isOfGround(look.field) ? bare : null,
+      ...(isAge ? agesSaid(range, told) : []),
       isAge && told.log !== "whole" ? h("p", {}, told.log === "read" ? READING : `or older: changed ${FAR}`) : null,
     );
     controls()[focused]?.focus();
@@ -100,10 +105,21 @@ export class Legend {
   }
 }
 
+/** Edges of colour that are the cells' own, and say nothing of the building. */
+function byCell({ cellM }: Told): HTMLElement {
+  return h("p", { class: "hint" }, `Known by cell, cubes of ${metres(cellM)}: a commit colours all of each cell that it touched.`);
+}
+
+/** Ages as times of day, as people tell them. */
+function agesSaid([low, high]: [number, number], told: Told): HTMLElement[] {
+  const { newestS } = told;
+  return newestS === null ? [byCell(told)] : [h("p", {}, `from ${clock(newestS - high)} to ${clock(newestS - low)}`), byCell(told)];
+}
+
 function titleOf(field: Field, told: Told, { shift }: Values): string {
   const { label, unit } = FIELDS.find((one) => one.field === field)!;
   if (field === "difficulty") return "Difficulty for a usual vehicle";
-  if (field === "age") return `Age, ${told.unit} before the newest measurement`;
+  if (field === "age") return `Age by cell, ${told.unit} before the newest measurement`;
   if (field === "height" && shift) return `Height over the floor, ${unit}`;
   return `${label}${unit ? `, ${unit}` : ""}`;
 }

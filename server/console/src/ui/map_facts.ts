@@ -1,8 +1,9 @@
-/** What the map is made of. */
+/** What the map is made of, and the zone in which its times are told. */
 
 import { h } from "../dom.ts";
 import type { MapInfo } from "../messages.ts";
 import { metres } from "../units.ts";
+import { pageZone, setPageZone, zoneNames } from "../zone.ts";
 
 export function mapFacts({ geometry, sensor_model }: MapInfo): HTMLElement {
   const edge = geometry.voxel_edge_um / 1e6;
@@ -12,5 +13,13 @@ export function mapFacts({ geometry, sensor_model }: MapInfo): HTMLElement {
     `shown: p above ${sensor_model.p_occupied}`,
     geometry.channels.map(({ name }) => name).join(", ") || "no channels",
   ];
-  return h("section", { "aria-label": "Map" }, h("h2", {}, "Map"), ...lines.map((line) => h("p", { class: "hint" }, line)));
+  const zones = h("select", {}, ...zoneNames().map((name) => h("option", { value: name, selected: name === pageZone().name }, name)));
+  zones.addEventListener("change", () => {
+    setPageZone(zones.value);
+    location.reload(); // all that is written is written again; the address keeps the view
+  });
+  return h(
+    "section", { class: "map-facts", "aria-label": "Map" }, h("h2", {}, "Map"), ...lines.map((line) => h("p", { class: "hint" }, line)),
+    h("label", { class: "hint" }, "times in ", zones),
+  );
 }

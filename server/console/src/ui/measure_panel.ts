@@ -4,7 +4,10 @@
 
 import { BufferGeometry, Float32BufferAttribute, LineBasicMaterial, LineSegments, Vector3 } from "three";
 import { facts, fill, h, svg } from "../dom.ts";
+import { POINTS_MAX, type Look } from "../look.ts";
+import type { Triple } from "../messages.ts";
 import type { Cells } from "../scene/cells.ts";
+import { uniforms } from "../scene/materials.ts";
 import { profileOf, volumeOver, type Profile } from "../scene/section.ts";
 import type { Stage } from "../scene/stage.ts";
 import { metres } from "../units.ts";
@@ -20,7 +23,7 @@ export class MeasurePanel {
   /** Clicks set points from now on, or no more. */
   onSwitch: (isOn: boolean) => void = () => {};
   private readonly voxelM: number;
-  private readonly points: Vector3[] = [];
+  private points: Vector3[] = [];
   private readonly toggle = h("button", { type: "button", "aria-pressed": "false", title: "Clicks set points (M)" }, "Set points");
   private readonly undo = h("button", { type: "button" }, "Undo");
   private readonly again = h("button", { type: "button" }, "Clear");
@@ -28,10 +31,14 @@ export class MeasurePanel {
   /** Words at the lines, in the picture. */
   readonly words = h("div", { class: "lengths", "aria-hidden": "true" });
   private written: { word: HTMLElement; at: Vector3 }[] = [];
+  /** What profile and volume were made of. */
+  private madeOf = "";
   private readonly cells: Cells;
+  private readonly look: Look;
 
-  constructor(cells: Cells, voxelM: number) {
+  constructor(cells: Cells, look: Look, voxelM: number) {
     this.cells = cells;
+    this.look = look;
     this.voxelM = voxelM;
     this.lines.frustumCulled = false;
     this.lines.renderOrder = 11;
@@ -39,7 +46,24 @@ export class MeasurePanel {
     this.undo.addEventListener("click", () => (this.points.pop(), this.show()));
     this.again.addEventListener("click", () => this.clear());
     fill(this.element, h("h2", {}, "Measure"), h("div", { class: "buttons" }, this.toggle, this.undo, this.again), this.said);
+    this.follow();
+  }
+
+  /** Take the points that an address names. */
+  follow(): void {
+    this.points = this.look.points.map((point) => new Vector3(...point));
     this.show();
+  }
+
+  /** A few times a second: what is shown may have become finer, or is of another moment. */
+  tick(): void {
+    if (this.points.length > 1 && !this.cells.waiting && !this.cells.needsPlan && this.madeOf !== this.shown) this.show();
+  }
+
+  /** What of the map is shown, in short. */
+  private get shown(): string {
+    const { uLow, uHigh, uMinP } = uniforms;
+    return JSON.stringify([this.cells.drawn, this.cells.head, this.look.atS, uLow.value, uHigh.value, uMinP.value]);
   }
 
   /** Whether clicks set points, rather than ask of voxels. */
@@ -53,8 +77,9 @@ export class MeasurePanel {
     this.onSwitch(this.isOn);
   }
 
+  /** Beyond as many as an address holds, points are not taken. */
   add(point: Vector3): void {
-    this.points.push(point.clone());
+    if (this.points.length < POINTS_MAX) this.points.push(point.clone());
     this.show();
   }
 
@@ -83,6 +108,8 @@ export class MeasurePanel {
 
   private show(): void {
     const { points } = this;
+    this.look.points = points.map((point) => point.toArray() as Triple);
+    this.madeOf = this.shown;
     this.undo.disabled = this.again.disabled = points.length === 0;
     const steps = points.slice(1).map((point, n) => point.distanceTo(points[n]));
     const ends = points.slice(1).flatMap((point, n) => [...points[n].toArray(), ...point.toArray()]);
@@ -110,7 +137,7 @@ export class MeasurePanel {
     }
     const profile = steps.length ? profileOf(this.cells, points[points.length - 2], points[points.length - 1]) : null;
     const hint = !this.isOn && !points.length ? "Length and profile of two clicks, area and volume of three or more."
-      : points.length < 2 ? "Click surfaces of the map." : `Each end is exact to about a voxel, ${metres(this.voxelM)}.`;
+      : points.length < 2 ? "Click surfaces of the map." : points.length === POINTS_MAX ? `${POINTS_MAX} points are the most.` : `Each end is exact to about a voxel, ${metres(this.voxelM)}.`;
     this.write(steps);
     fill(this.said, rows.length > 0 && facts(rows), profile && profilePicture(profile), h("p", { class: "hint" }, hint));
     this.onChange();

@@ -12,7 +12,7 @@ import { digestOfMap, type MapDigest } from "../map_digest.ts";
 import type { Branch, MapInfo } from "../messages.ts";
 import { serverNowS } from "../server_time.ts";
 import { metres, thousands } from "../units.ts";
-import { zoneNames, zoneOf, type Zone } from "../zone.ts";
+import { pageZone, zoneNames, zoneOf, type Zone } from "../zone.ts";
 
 const ZONE_KEY = "cairn.zone";
 /** Of a plan and of a picture on paper, px; and pictures of a report at most. */
@@ -35,7 +35,7 @@ export async function openReport(source: ReportSource): Promise<void> {
   const { api, info } = source;
   const body = h("div", { class: "sheet" }, h("p", { role: "status" }, "The report is made …"));
   const zones = h("select", { id: "zone" }, ...zoneNames().map((name) => h("option", { value: name }, name)));
-  zones.value = localStorage.getItem(ZONE_KEY) ?? "UTC";
+  zones.value = localStorage.getItem(ZONE_KEY) ?? pageZone().name;
   const print = h("button", { type: "button", class: "main", disabled: true, onclick: () => window.print() }, "Print, or save as PDF");
   const close = h("button", { type: "button" }, "Close");
   const dialog = h(

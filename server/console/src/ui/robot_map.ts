@@ -51,6 +51,8 @@ export class RobotMap {
   /** One at a time: a robot that moves on must not leave each picture behind before it is drawn. */
   private async load(robot: string, query: string): Promise<void> {
     this.busy = true;
+    if (this.element.hidden) fill(this.element, h("p", { class: "hint", role: "status" }, `The server draws the map from ${robot}'s pose …`));
+    this.element.hidden = false;
     let picture: HTMLElement;
     let failed = false;
     try {

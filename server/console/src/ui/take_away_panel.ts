@@ -132,13 +132,19 @@ export class TakeAwayPanel {
     const button = event.currentTarget as HTMLButtonElement;
     button.disabled = true;
     this.said.className = "hint";
-    this.said.textContent = "The server makes the file ...";
+    const startMs = performance.now();
+    const tell = () => (this.said.textContent = `The server makes the file … ${Math.round((performance.now() - startMs) / 1000)} s`);
+    tell();
+    const timer = window.setInterval(tell, 1000);
     try {
-      this.said.textContent = await fetched();
+      const done = await fetched();
+      window.clearInterval(timer);
+      this.said.textContent = done;
     } catch (error) {
       this.said.className = "error";
       this.said.textContent = (error as Error).message;
     } finally {
+      window.clearInterval(timer);
       button.disabled = false;
     }
   }

@@ -5,6 +5,7 @@
 import { fill, h } from "../dom.ts";
 import type { FullShare } from "../duties.ts";
 import type { Branch, RobotSign } from "../messages.ts";
+import { HELP } from "../news.ts";
 import { robotColour } from "../palettes.ts";
 import { serverNowS } from "../server_time.ts";
 import { ago, bytes } from "../units.ts";
@@ -24,8 +25,6 @@ const LATE_COMMITS = 20;
 /** Gravest first; `said`: what is written in the line. */
 const TROUBLES = ["stuck", "offline", "battery", "late", "waiting"] as const;
 type Trouble = (typeof TROUBLES)[number];
-/** Words of a robot's own note that say that it needs help. */
-const HELP = /\b(stuck|help|fault|error|lost|blocked|emergency|failed|fallen)\b/i;
 
 interface Row {
   readonly name: string;

@@ -6,7 +6,7 @@ import { fieldsOf, type Field } from "../look.ts";
 import { layerText, mapOf } from "../map_layers.ts";
 import type { MapInfo } from "../messages.ts";
 import { isClockTrusted } from "../server_time.ts";
-import { ago } from "../units.ts";
+import { ago, bytes, counted } from "../units.ts";
 
 const THEME_KEY = "cairn.theme";
 
@@ -28,7 +28,7 @@ export class TopBar {
     const own = mapOf(map);
     const layers = maps.filter(({ name }) => mapOf(name) === own);
     const names = [...new Set(maps.map(({ name }) => mapOf(name)))];
-    const choice = chooser("Map", names.map((name) => [name, name]), own);
+    const choice = chooser("Map", names.map((name) => [name, choiceOf(name, maps)]), own);
     const layer = layers.length > 1 ? chooser("Layer", layers.map((one) => [one.name, layerText(one)]), map) : null;
     const fields = fieldsOf(geometry);
     this.fields = h(
@@ -77,6 +77,12 @@ export class TopBar {
     this.link.dataset.state = state;
     fill(this.link, said);
   }
+}
+
+/** A map by what tells it from others; one of which this token sees a layer alone has its name. */
+function choiceOf(map: string, maps: readonly MapInfo[]): string {
+  const info = maps.find(({ name }) => name === map);
+  return info ? `${map} · ${counted(info.cells, "cell", "cells")}, ${bytes(info.size_bytes)}, ${counted(info.branches, "robot", "robots")}` : map;
 }
 
 /** Dark or light: as the system says, or as was chosen here. */
