@@ -93,6 +93,7 @@ def _word(builder: Any, address: Any) -> Any:
 @nb.njit(nogil=True, forceinline=True)
 def _begin(number: np.uint64) -> np.uint64:
     """Slot of a map for one call, counted in; 0 if it is closed, and then not counted."""
+    # The number without its generation, as an address; 0 is what a caller has that was given nothing.
     slot = (number >> U(GENERATION_BITS)) << U(SLOT_BITS)
     if slot == 0:
         return U(0)
@@ -106,15 +107,18 @@ def _begin(number: np.uint64) -> np.uint64:
 
 @nb.njit(nogil=True, forceinline=True)
 def _end(slot: np.uint64) -> None:
+    # Less one, without a sign: reads that come before it are done before closing sees the counter.
     add_at(slot, U(0xFFFFFFFFFFFFFFFF))
 
 
 @nb.njit(nogil=True, forceinline=True)
 def _state(slot: np.uint64, x_m: float, y_m: float, z_m: float) -> np.int32:
     """State at a point, of the finest layer that knows it; OUTSIDE if the point is outside of any layer's space."""
+    # Of the slot, which does not change while this call is counted.
     words = _array(slot, nb.uint64, 8)
     count, found = words[LAYERS], np.int32(UNKNOWN)
     for layer in range(count):
+        # The row of one layer, its words read as the types that they are.
         row = words[ROWS] + U(layer) * U(ROW) * WORD
         integers, reals = _array(row, nb.int64, ROW), _array(row, nb.float64, ROW)
         addresses = _array(row, nb.uint64, ROW)
@@ -123,8 +127,10 @@ def _state(slot: np.uint64, x_m: float, y_m: float, z_m: float) -> np.int32:
         # Of NaN each comparison is false.
         if not ((abs(x_m) < reach_m) & (abs(y_m) < reach_m) & (abs(height_m) < reach_m)):
             return OUTSIDE
+        # Layers behind the one that answers only say whether the point is outside, as `LayeredSnapshot` asks them all.
         if found != UNKNOWN:
             continue
+        # The grid that `states_into` has; its list of cells and their box are not needed for a point.
         none = _array(addresses[NUMBERS_AT], nb.int64, (0, 3))
         grid = Grid(
             integers[EDGE_NM],
@@ -144,6 +150,7 @@ def _state(slot: np.uint64, x_m: float, y_m: float, z_m: float) -> np.int32:
 
 @nb.njit(nogil=True, forceinline=True)
 def _state_in_grid(grid: Grid, x_m: float, y_m: float, z_m: float) -> np.uint8:
+    # Voxel, cell, brick, bits: the steps of `point_kernels.states_into`, for one point.
     x, y, z = voxel_of(x_m, grid.edge_nm), voxel_of(y_m, grid.edge_nm), voxel_of(z_m, grid.edge_nm)
     slot = slot_of(grid, x >> grid.depth, y >> grid.depth, z >> grid.depth)
     if slot == NONE:
@@ -165,6 +172,7 @@ def _state_at(number: np.uint64, x_m: float, y_m: float, z_m: float) -> np.int32
 
 def _states_at(number: np.uint64, points_m: Any, count: int, states: Any) -> np.int32:
     """`cairn_states` of the header."""
+    # Counted once for all points, so that many threads do not wait for each other's counting.
     slot = _begin(number)
     if slot == 0:
         return CLOSED
@@ -192,6 +200,7 @@ def states_function() -> Any:
 @nb.njit(cache=True, nogil=True)
 def close_slot(address: int) -> bool:
     """Take a slot's number away; True once no call is in progress. To be called until it is True."""
+    # The number first, then the counter: the mirror of `_begin`.
     slot = U(address)
     exchange_at(slot + U(NUMBER) * WORD, U(0))
     return bool(load_at(slot) == U(0))
@@ -200,4 +209,5 @@ def close_slot(address: int) -> bool:
 @nb.njit(cache=True, nogil=True)
 def open_slot(address: int, number: np.uint64) -> None:
     """Give a slot, whose other words are written, its number."""
+    # Last of all, with everything that was written before: a call that finds the number finds the rows.
     exchange_at(U(address) + U(NUMBER) * WORD, number)
