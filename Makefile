@@ -22,6 +22,8 @@ WORKERS := --numprocesses $(shell echo $$(( $$(getconf _NPROCESSORS_ONLN) + 1 ))
 ROS2 ?= kilted
 # Of each target.
 SOAK_SECONDS ?= 600
+# Tests that do more where CAIRN_TEST_LENGTH is long.
+LONG = $(shell grep --recursive --files-with-matches --include='test_*.py' 'fixtures.lengths import' tests)
 KERNELS := $(shell find */cairn_* -name "*_kernels.py" -o -name warm_up.py)
 CONSOLE := $(shell find server/console -type f)
 # Node, for a page that is not built: build_console.py names the same.
@@ -49,7 +51,7 @@ test-ros2: .venv-ros2/$(ROS2).stamp  ## tests with a real ROS 2, from wheels, in
 	unshare --map-root-user --net bash -c 'ip link set lo up multicast on && ip route add 224.0.0.0/4 dev lo && \
 		RMW_IMPLEMENTATION=rmw_fastrtps_cpp exec .venv-ros2/$(ROS2)/bin/python -m pytest -W default tests/ros2 $(PYTEST_ARGS)'
 
-soak: .venv/dev.stamp .venv/kernels.stamp  ## crash, crowd, siege, replicas, simulate sync, fuzz (SOAK_SECONDS=600 of each, SOAK_ARGS="cell"), bad links, kills, calibrations
+soak: .venv/dev.stamp .venv/kernels.stamp  ## crash, crowd, siege, replicas, simulate sync, fuzz (SOAK_SECONDS=600 of each, SOAK_ARGS="cell"), bad links, kills, calibrations, long tests
 	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.crash --trials 1000 --kills 200)
 	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.crowd --robots 200 --seconds $(SOAK_SECONDS))
 	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.siege --seconds 30)
@@ -62,6 +64,7 @@ soak: .venv/dev.stamp .venv/kernels.stamp  ## crash, crowd, siege, replicas, sim
 	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.links --minutes 30)
 	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.links --minutes 15 --kill)
 	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.rig_seeds --seeds 200)
+	$(if $(SOAK_ARGS),,CAIRN_TEST_LENGTH=long $(BIN)/python -m pytest $(WORKERS) $(LONG))
 	$(if $(SOAK_ARGS),,OVERLAY_POSES=1000 CAIRN_FUSION_POSES=1000 $(BIN)/python -m pytest tests/cairn_fusion/{view/test_overlay,image_fusion/test_cross_view}.py)
 	$(if $(SOAK_ARGS),,$(BIN)/python -m tests.board_finding --boards 1000 --discs 300 --real 500 --empty 10000)
 	$(if $(SOAK_ARGS),,$(BIN)/cairn calib study --output build/study)

@@ -2,8 +2,11 @@
 
 import os
 import signal
+import ssl
 from collections.abc import Iterator
+from typing import Any
 
+import httpx
 import pytest
 from hypothesis import HealthCheck, settings
 
@@ -19,22 +22,41 @@ pytest.register_assert_rewrite("tests.fixtures")
 SLOWEST = (
     "tests/test_image.py",
     "tests/test_commands.py",
+    "tests/replicas/test_replicas.py",
     "tests/test_pages.py",
-    "tests/console/test_page.py",
     "tests/fuzz/test_fuzz.py",
-    "tests/cairn_sim/experiment/test_experiment.py",
-    "tests/console/test_screens.py",
-    "tests/console/test_access.py",
-    "tests/console/test_tabs.py",
+    "tests/replicas/test_lost_tail.py",
     "tests/cairn_client/robot/test_simulated.py",
-    "tests/cairn_calib/board/test_board_finding.py",
+    "tests/test_rolling_restart.py",
+    "tests/cairn_sim/experiment/test_experiment.py",
+    "tests/replicas/test_standby.py",
+    "tests/cairn_calib/corner_search/test_coded_boards.py",
+    "tests/links/test_links.py",
+    "tests/cairn_calib/board/discs/test_disc_finding.py",
+    "tests/links/test_namespaces.py",
+    "tests/cairn_client/http/test_bombs.py",
+    "tests/replicas/test_races.py",
+    "tests/cairn_server/operations/test_object_commands.py",
+    "tests/replicas/test_silent_cut.py",
+    "tests/console/test_picture.py",
+    "tests/console/test_looking.py",
+    "tests/console/test_large_maps.py",
+    "tests/console/test_page.py",
+    "tests/console/test_tabs.py",
+    "tests/console/",
 )
-"""By their time on two cores; the others take half a minute at most."""
+"""Files and folders by their time on two cores, those that mostly wait among those that compute.
+
+All of the browser's stand together: a worker that leaves them ends the room that they look at, and makes it again.
+"""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    ranks = {path: rank for rank, path in enumerate(SLOWEST)}
-    items.sort(key=lambda item: ranks.get(item.nodeid.partition("::")[0], len(SLOWEST)))
+    def rank(item: pytest.Item) -> int:
+        path = item.nodeid.partition("::")[0]
+        return next((n for n, slow in enumerate(SLOWEST) if path.startswith(slow)), len(SLOWEST))
+
+    items.sort(key=rank)
 
 
 def pytest_sessionstart() -> None:
@@ -57,3 +79,26 @@ def children_hear_interrupts() -> Iterator[None]:
     yield
     if ignored:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def authorities_are_read_once() -> Iterator[None]:
+    """Give all HTTP clients that trust the usual authorities one context: to read these takes 20 ms of a core.
+
+    Tests make thousands of clients, and most speak to http:// alone.
+    """
+    transports = httpx._transports.default  # type: ignore[attr-defined]
+    make = transports.create_ssl_context
+    kept: dict[object, ssl.SSLContext] = {}
+
+    def context(verify: Any = True, cert: Any = None, trust_env: bool = True) -> ssl.SSLContext:
+        if verify is not True or cert is not None:
+            return make(verify=verify, cert=cert, trust_env=trust_env)  # type: ignore[no-any-return]
+        named = (trust_env, os.environ.get("SSL_CERT_FILE"), os.environ.get("SSL_CERT_DIR"))
+        if named not in kept:
+            kept[named] = make(verify=verify, cert=cert, trust_env=trust_env)
+        return kept[named]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(transports, "create_ssl_context", context)
+        yield

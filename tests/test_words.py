@@ -9,6 +9,7 @@ import re
 import sys
 import tokenize
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -41,8 +42,13 @@ class Finding(NamedTuple):
         return f"{self.path}:{self.line}: {self.text}"
 
 
-def findings(path: Path) -> Iterator[Finding]:
+@cache
+def findings(path: Path) -> tuple[Finding, ...]:
     """All that one module has."""
+    return tuple(_found(path))
+
+
+def _found(path: Path) -> Iterator[Finding]:
     where = path.relative_to(ROOT).as_posix()
     if path.stem in NAMES:
         yield Finding(where, 1, f"module name {path.stem}")

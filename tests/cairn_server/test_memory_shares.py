@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tests.fixtures.map.costly import air, dust
 from tests.fixtures.map.made import made_meta
-from tests.fixtures.server.live import Live, Process, until
+from tests.fixtures.server.live import PROGRAM, Live, Process, until
 from tests.fixtures.server.memory_watch import MemoryWatch
 
 from cairn_map.commits.commit import make_commit
@@ -109,7 +109,7 @@ def sampled(geometry: Geometry, quarter: int) -> Evidence:
 def test_all_processes_stay_within_the_limit_that_was_said(tmp_path: Path) -> None:
     settings = tmp_path / "server.toml"
     settings.write_text(f"memory_bytes = {LIMIT_MIN_BYTES}\n")
-    server = Process(tmp_path / "data", "--settings", str(settings))
+    server = Process(tmp_path / "data", "--settings", str(settings), under=PROGRAM)
     assert server.url is not None
     watch = MemoryWatch(server.pid)
     try:

@@ -1,18 +1,18 @@
 """A small share of `python -m tests.board_finding`, which `make soak` runs at length."""
 
-import os
-
 import cv2
 import pytest
-from tests.board_finding.empty_images import SMALL, empty_image
+from tests.board_finding.empty_images import KINDS, SMALL, empty_image
 from tests.board_finding.real_boards import changed, found_as_recorded, found_by_opencv, near, recorded, voted
 from tests.board_finding.trials import found_rightly, trial
 from tests.fixtures.calib.board_images import BOARD
+from tests.fixtures.lengths import length
 
 from cairn_calib.board.corner_detection import find_chessboard
 
-EMPTY = int(os.environ.get("EMPTY_IMAGES", "300"))
-REAL = int(os.environ.get("REAL_BOARDS", "10"))
+EMPTY, LARGE = length(5, long=15) * len(KINDS), length(1, long=3) * len(KINDS)
+"""Images of all kinds alike."""
+REAL = length(6, long=10)
 
 
 # 10573: so aslant that the nearest saddle along an edge is the one across a cell.
@@ -53,7 +53,7 @@ def test_what_was_once_a_board_or_an_error_is_neither() -> None:
 
 @pytest.mark.slow
 def test_no_grid_is_found_in_large_images_without_a_board() -> None:
-    for seed in range(EMPTY // 6):
+    for seed in range(LARGE):
         _, image = empty_image(seed, sizes=SMALL)
         large = cv2.resize(image, None, fx=6, fy=6, interpolation=cv2.INTER_CUBIC)
         assert find_chessboard(large, BOARD).corners is None, seed

@@ -3,21 +3,22 @@
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cache
 
 import cv2
 import numpy as np
 import pytest
-from tests.board_finding.empty_images import SMALL, empty_image
+from tests.board_finding.empty_images import KINDS, SMALL, empty_image
 from tests.fixtures.calib.board_images import COLOUR, THERMAL, TOF, Floats, Image, Spectrum
 from tests.fixtures.calib.coded_sheets import (
     BIT_PX,
-    Sheet,
     aprilgrid_sheet,
     charuco_sheet,
     sheet_picture,
     sheet_pose,
     sheet_truth,
 )
+from tests.fixtures.lengths import length
 
 from cairn_calib.board.board import Board
 from cairn_calib.board.corner_detection import grey
@@ -95,7 +96,7 @@ def test_corners_of_sheets_seen_whole_and_in_part_lie_where_they_are_with_the_er
     spectrum, range_m = RANGES[camera]
     board = SHEETS[name][1]
     errors, covariances, seen, there = [], [], 0, 0
-    for shot in shots(name, spectrum, range_m, 4, seed=11):
+    for shot in shots(name, spectrum, range_m, length(2, long=4), seed=11):
         corners = found(shot.image, board)
         errors.append((corners.pixels - shot.at)[corners.seen])
         covariances.append(corners.covariance_px2[corners.seen])
@@ -113,7 +114,7 @@ def test_corners_of_sheets_seen_whole_and_in_part_lie_where_they_are_with_the_er
 def test_corners_are_at_least_as_many_and_as_accurate_as_opencvs(name: str) -> None:
     board = SHEETS[name][1]
     ours, theirs, counts = [], [], [0, 0]
-    for shot in shots(name, COLOUR, (0.4, 2.2), 5, seed=12):
+    for shot in shots(name, COLOUR, (0.4, 2.2), length(2, long=5), seed=12):
         corners, other = found(shot.image, board), by_opencv(np.asarray(shot.image, np.uint8), name)
         both = corners.seen & np.isfinite(other[:, 0])
         ours.append((corners.pixels - shot.at)[both])
@@ -206,8 +207,10 @@ def test_tags_of_a_dozen_pixels_are_read_where_opencv_reads_none(name: str) -> N
         assert np.nanmax(np.abs(corners.pixels - shot.at)) < 0.4
 
 
-def shot_of(sheet: Sheet) -> Image:
-    rng = np.random.default_rng(4)
+@cache
+def shot_of(name: str) -> Image:
+    """One image of a sheet, seen whole."""
+    (sheet, _), rng = SHEETS[name], np.random.default_rng(4)
     return sheet_picture(COLOUR, sheet_pose(rng, COLOUR, sheet, range_m=(0.9, 0.9)), sheet, rng)
 
 
@@ -227,8 +230,7 @@ def shot_of(sheet: Sheet) -> Image:
 def test_a_board_that_is_stated_wrongly_is_refused_with_what_is_seen(
     name: str, stated: dict[str, object], reason: str
 ) -> None:
-    sheet, board = SHEETS[name]
-    detection = search(shot_of(sheet), board.model_copy(update=stated))
+    detection = search(shot_of(name), SHEETS[name][1].model_copy(update=stated))
     assert detection.corners is None
     assert detection.attempts[-1].stage == "tags"
     assert re.search(reason, detection.attempts[-1].reason), detection.attempts[-1].reason
@@ -236,9 +238,9 @@ def test_a_board_that_is_stated_wrongly_is_refused_with_what_is_seen(
 
 @pytest.mark.slow
 def test_the_other_kind_of_sheet_is_named() -> None:
-    detection = search(shot_of(SHEETS["aprilgrid"][0]), CHARUCO)
+    detection = search(shot_of("aprilgrid"), CHARUCO)
     assert detection.attempts[-1].reason.endswith("say --pattern aprilgrid --tags 36h11")
-    detection = search(shot_of(SHEETS["charuco"][0]), APRILGRID)
+    detection = search(shot_of("charuco"), APRILGRID)
     assert detection.attempts[-1].reason.endswith("say --pattern charuco --tags 5x5_50")
 
 
@@ -246,7 +248,7 @@ def test_the_other_kind_of_sheet_is_named() -> None:
 @pytest.mark.parametrize("name", SHEETS)
 def test_no_board_is_found_in_images_without_tags(name: str) -> None:
     board = SHEETS[name][1].model_copy(update={"dictionary": "4x4_50"} if name == "charuco" else {})
-    for seed in range(20):
+    for seed in range(len(KINDS)):
         _, image = empty_image(seed, sizes=SMALL)
         assert search(image, board).corners is None
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.fixtures.calib.simulated_views import COLOUR, PLACES, THERMAL, TOF
+from tests.fixtures.lengths import length
 
 from cairn_calib.cli.main import main
 from cairn_calib.rig.calibration import Calibration, covariance_from_matrix
@@ -79,7 +80,7 @@ def test_calibrations_with_the_stated_noise_agree_as_often_as_stated_and_no_more
     names, covariance = covariances()
     rng, root = np.random.default_rng(5), np.linalg.cholesky(covariance)
     scores: dict[tuple[str, str | None], list[PixelComparison]] = {}
-    for _ in range(80):
+    for _ in range(length(30, long=80)):
         a, b = (rig_with(root @ rng.normal(size=len(names))) for _ in range(2))
         for each in compare_rigs(a, b, BOTH, (range_m,)):
             scores.setdefault((each.camera, each.source), []).append(each)

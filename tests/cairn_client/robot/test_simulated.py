@@ -4,11 +4,13 @@
 """
 
 import pytest
+from tests.fixtures.lengths import length
 from tests.sync_sim.history import failures, run_seed
 
 pytestmark = pytest.mark.slow
 
-SEEDS, PART = 800, 50
+SEEDS, PART = length(300, long=800), 50
+"""So many seeds notice every rule that is switched off: `python -m tests.rules_off --simulated 300`."""
 
 
 @pytest.mark.parametrize("first", range(0, SEEDS, PART))

@@ -1,6 +1,6 @@
 """A reply's header at the limits of PROTOCOL.md section 6: read by every client, and small, whoever filled the map."""
 
-from pathlib import Path
+from collections.abc import Iterator
 
 import pytest
 from tests.fixtures.server.crowded_map import add_cells, add_commits, long_author
@@ -23,11 +23,11 @@ ASKER = AUTHORS[0]
 DESK = Author(OPERATOR, Incarnation("f" * 16))  # type: ignore[arg-type]
 
 
-@pytest.fixture
-def crowded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Live:
-    """A server whose first map is as full as a map may be."""
-    with Live(tmp_path) as own:
-        monkeypatch.setattr(own.service._fold_thread, "_fold_group", lambda *arguments: 0)
+@pytest.fixture(scope="module")
+def crowded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Live]:
+    """A server whose first map is as full as a map may be; it takes long to fill, and tests only read it."""
+    with Live(tmp_path_factory.mktemp("crowded")) as own, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(own.service._fold_thread, "_fold_group", lambda *arguments: 0)
         store, row = own.service.store, own.new_map()
         folded = [CommitId(author, LAST) for author in AUTHORS]
         gaps = [CommitId(author, LAST - 2) for author in AUTHORS[:SPLIT]]

@@ -6,9 +6,12 @@ A small share of `python -m tests.board_finding`, which `make soak` runs at leng
 import numpy as np
 import pytest
 from tests.board_finding.disc_trials import EMPTY_BOARDS, disc_trial, false_grids
-from tests.board_finding.empty_images import SMALL, empty_image
+from tests.board_finding.empty_images import KINDS, SMALL, empty_image
+from tests.fixtures.lengths import length
 
-WHOLE, CUT, EMPTY = range(12), range(1000, 1004), range(120)
+WHOLE, CUT = range(length(6, long=12)), range(1000, 1004)
+EMPTY = range(length(4 * len(KINDS), long=8 * len(KINDS)))
+"""Each kind of image, and another board for each seed."""
 
 
 @pytest.mark.slow

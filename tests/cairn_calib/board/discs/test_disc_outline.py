@@ -1,6 +1,7 @@
 """Outlines of discs: centroids against those of the region itself, in recorded images of near, large discs."""
 
 import os
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -23,13 +24,23 @@ REGION_RMS_PX = 0.15
 PUBLISHED_FX_PX = 496.3
 
 
-def wide_images() -> list[tuple[str, npt.NDArray[np.uint8]]]:
-    """Names and grey images of the recording; skips where it is not at hand."""
+@dataclass(frozen=True)
+class Wide:
+    """One image of the recording, and the grid in it."""
+
+    name: str
+    image: npt.NDArray[np.uint8]
+    corners: Corners
+    disc_pitches: float | None
+
+
+@pytest.fixture(scope="module")
+def wide() -> list[Wide]:
+    """All images of the recording, searched once; skips where it is not at hand."""
     folder = os.environ.get("CAIRN_TEST_DATA")
     if not folder:
         pytest.skip("CAIRN_TEST_DATA is not set")
-    paths = sorted((Path(folder) / "disc_grid_wide").glob("*.png"))
-    return [(path.name, np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), np.uint8)) for path in paths]
+    return [searched(path) for path in sorted((Path(folder) / "disc_grid_wide").glob("*.png"))]
 
 
 def region_centroid(image: npt.NDArray[np.uint8], near: Floats) -> Floats:
@@ -65,20 +76,20 @@ def region_centroid(image: npt.NDArray[np.uint8], near: Floats) -> Floats:
     return np.array([X[at].mean(), Y[at].mean()]) + low
 
 
-def found(image: npt.NDArray[np.uint8]) -> Corners:
+def searched(path: Path) -> Wide:
+    image = np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), np.uint8)
     detection = find_circles(image, WIDE, upright=True)
     assert detection.corners is not None, [str(attempt) for attempt in detection.attempts]
-    return detection.corners
+    return Wide(path.name, image, detection.corners, detection.disc_pitches)
 
 
 @pytest.mark.recording
-def test_near_large_discs_through_a_wide_lens_are_where_their_regions_are() -> None:
+def test_near_large_discs_through_a_wide_lens_are_where_their_regions_are(wide: list[Wide]) -> None:
     misses = []
-    for name, image in wide_images():
-        corners = found(image)
-        assert corners.seen.all(), name
-        regions = np.array([region_centroid(image, at) for at in corners.pixels])
-        misses.append(corners.pixels - regions)
+    for each in wide:
+        assert each.corners.seen.all(), each.name
+        regions = np.array([region_centroid(each.image, at) for at in each.corners.pixels])
+        misses.append(each.corners.pixels - regions)
     off = np.concatenate(misses)
     assert len(off) == 7 * 12
     assert np.sqrt((off**2).mean()) < REGION_RMS_PX
@@ -86,9 +97,11 @@ def test_near_large_discs_through_a_wide_lens_are_where_their_regions_are() -> N
 
 
 @pytest.mark.recording
-def test_their_calibration_is_the_published_one_where_centroids_taken_for_centres_are_far_off() -> None:
-    corners = [found(image) for _, image in wide_images()]
-    shown = np.median([find_circles(image, WIDE, upright=True).disc_pitches for _, image in wide_images()])
+def test_their_calibration_is_the_published_one_where_centroids_taken_for_centres_are_far_off(
+    wide: list[Wide],
+) -> None:
+    corners = [each.corners for each in wide]
+    shown = np.median([each.disc_pitches for each in wide])
     assert shown == pytest.approx(0.78, abs=0.01)
     views = tuple(BoardView("left", f"{n}", f"{n}.png", each) for n, each in enumerate(corners))
     solution = solve_rig(BoardViews(WIDE, {"left": (1440, 1080)}, views), usual_plan({"left": Spectrum.COLOUR}))
