@@ -74,7 +74,7 @@ class Bound:
 OPEN = Bound(place="open ground", within_three=0.99)
 BELOW = {
     "pipe bridge/deck": Bound(place="below the bridge", largest_m=0.12),
-    GRASS: Bound(place="in high grass", largest_m=0.12),
+    GRASS: Bound(place="in high grass", median_m=0.03, largest_m=0.12),
     "waiting": Bound(place="where a person stood", largest_m=0.12),
 }
 """By what is above the ground."""
