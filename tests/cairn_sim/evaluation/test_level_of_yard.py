@@ -1,13 +1,16 @@
 """The yard as a level against its truth: the open ground, what is below things, and an honest sigma."""
 
+import io
+
 import numpy as np
 import pytest
+from rich.console import Console
 from tests.fixtures.sim.yard import mapped, scans_of_yard
 
-from cairn_map.errors import BadInputError
+from cairn_map.errors import BadInputError, DamagedDataError
 from cairn_map.queries.level.elevation import Elevation
 from cairn_map.queries.map_snapshot import snapshot_of
-from cairn_sim.demo.yard import BELOW, GRASS, LASTS_S, OPEN, SCENE
+from cairn_sim.demo.yard import BELOW, GRASS, LASTS_S, OPEN, SCENE, require_true_ground
 from cairn_sim.evaluation.ground_truth import ground_errors, ground_errors_below
 from cairn_sim.robots.record import Plan
 from cairn_sim.robots.robots import ROBOTS
@@ -55,6 +58,9 @@ def test_errors_are_those_of_the_heights(scene: Scene, ground: Elevation) -> Non
         true, higher = (ground_errors_below(scene, each, name).error_m for each in (ground, lifted))
         np.testing.assert_allclose(higher - true, 0.5)
     assert len(ground_errors(scene, lifted).error_m) <= known.sum()
+    require_true_ground(scene, ground, Console(file=io.StringIO()))
+    with pytest.raises(DamagedDataError, match="open ground: expected"):
+        require_true_ground(scene, lifted, Console(file=io.StringIO()))
 
 
 def test_a_thing_that_is_not_there_is_refused(scene: Scene, ground: Elevation) -> None:
