@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from cairn_calib.rig.rig import Rig, load_rig
     from cairn_client.folders.map_folder import open_layers, open_map
     from cairn_client.replica.limits import Limits
-    from cairn_client.robot.layer_places import LayerPlaces
     from cairn_client.robot.layered_robot import LayeredRobot
     from cairn_client.robot.robot import Robot
     from cairn_client.robot.robot_events import (
@@ -67,7 +66,6 @@ __all__ = [
     "Elevation",
     "Event",
     "Geometry",
-    "LayerPlaces",
     "LayeredRobot",
     "LayeredSnapshot",
     "Limits",
@@ -106,7 +104,6 @@ _MODULES = {
     "cairn_calib.rig.rig": "Rig load_rig",
     "cairn_client.folders.map_folder": "open_layers open_map",
     "cairn_client.replica.limits": "Limits",
-    "cairn_client.robot.layer_places": "LayerPlaces",
     "cairn_client.robot.layered_robot": "LayeredRobot",
     "cairn_client.robot.robot": "Robot",
     "cairn_client.robot.robot_events": """

@@ -16,21 +16,27 @@ from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import DamagedDataError, UnreachableError
 from cairn_map.evidence.grid import CellKey, cell_key
 
-LEVEL_WITHIN_S = 30.0
+LEVEL_WITHIN_S = 120.0
 Identity = tuple[str, str]
 """SHA-256 of a cell's canonical bytes, and its fingerprint, in hex."""
 
 
 def bring_level(robots: Sequence[Robot], api: MapApi, map_name: str) -> None:
-    """Sync until the server folded every commit and every robot has all of it.
+    """Sync until the server folded every commit and every robot has all of it; a busy server is asked again.
 
     Raises:
         UnreachableError: it took longer than `LEVEL_WITHIN_S`.
     """
     deadline_s = time.monotonic() + LEVEL_WITHIN_S
-    for robot in robots:
-        robot.sync()
-    while api.cell_index(map_name).header.pending or any(robot.waiting for robot in robots):
+    while True:
+        try:
+            for robot in robots:
+                robot.sync()
+            if not (api.cell_index(map_name).header.pending or any(robot.waiting for robot in robots)):
+                break
+        except UnreachableError:
+            if time.monotonic() > deadline_s:
+                raise
         if time.monotonic() > deadline_s:
             raise UnreachableError("not_level", f"the server did not fold all commits within {LEVEL_WITHIN_S:.0f} s")
         time.sleep(0.05)

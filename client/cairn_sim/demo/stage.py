@@ -46,6 +46,10 @@ def demo_server(folder: Path) -> Iterator[str]:
         yield found.group(0)
     finally:
         process.terminate()
-        process.wait(timeout=SERVER_STOP_S)
+        try:
+            process.wait(timeout=SERVER_STOP_S)
+        except subprocess.TimeoutExpired:  # what it acknowledged is durable
+            process.kill()
+            process.wait()
         if process.stdout:
             process.stdout.close()

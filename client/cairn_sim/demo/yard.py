@@ -74,7 +74,7 @@ class Bound:
 OPEN = Bound(place="open ground", within_three=0.99)
 BELOW = {
     "pipe bridge/deck": Bound(place="below the bridge", largest_m=0.12),
-    GRASS: Bound(place="in high grass", largest_m=0.12),
+    GRASS: Bound(place="in high grass", median_m=0.03, largest_m=0.12),
     "waiting": Bound(place="where a person stood", largest_m=0.12),
 }
 """By what is above the ground."""
@@ -113,10 +113,10 @@ def show_yard(
         try:
             for member in team:
                 console.print(f"  {member.name}: {member.plan.robot.about}; {member.stop_count} stops")
-            _drive(team, api, console)
-            _require_equal_maps(team, api, console)
+            drive_team(team, api, console)
+            require_equal_maps(team, api, console)
             ground = team[0].robot.snapshot()[GROUND].elevation()
-            _require_true_ground(scene, ground, console)
+            require_true_ground(scene, ground, console)
             _write(team[0], ground, folder, console)
         finally:
             for member in team:
@@ -141,8 +141,12 @@ def yard_plans(scene: Scene, seed: int, scans: tuple[int, int]) -> dict[str, Pla
     }
 
 
-def _drive(team: Sequence[YardRobot], api: MapApi, console: Console) -> None:
-    """Let the robots measure in turn until all arrived; show the table."""
+def drive_team(team: Sequence[YardRobot], api: MapApi, console: Console) -> None:
+    """Let the robots measure in turn until all arrived and have all of the map; show the table.
+
+    Raises:
+        CairnError: as `YardRobot.measure`; the server did not fold all commits.
+    """
     with Live(console=console, refresh_per_second=4) as live:
         driving = list(team)
         while driving:
@@ -174,7 +178,12 @@ def _table(team: Sequence[YardRobot]) -> Table:
     return table
 
 
-def _require_equal_maps(team: Sequence[YardRobot], api: MapApi, console: Console) -> None:
+def require_equal_maps(team: Sequence[YardRobot], api: MapApi, console: Console) -> None:
+    """Refuse layers that differ between the server and the robots.
+
+    Raises:
+        DamagedDataError: kind `maps_differ`, naming the two.
+    """
     count = 0
     for layer, name in LAYERS.items():
         identities = {"the server": server_identity(api, name)}
@@ -187,8 +196,12 @@ def _require_equal_maps(team: Sequence[YardRobot], api: MapApi, console: Console
     )
 
 
-def _require_true_ground(scene: Scene, ground: Elevation, console: Console) -> None:
-    """Refuse a level whose heights are not the scene's."""
+def require_true_ground(scene: Scene, ground: Elevation, console: Console) -> None:
+    """Refuse a level whose heights are not the scene's.
+
+    Raises:
+        DamagedDataError: kind `ground_wrong`, naming the place and its errors.
+    """
     free = scene.at(CLOCK_START_S + LASTS_S)
     found = [(OPEN, ground_errors(free, ground, without=(GRASS,)))]
     found += [(bound, ground_errors_below(scene, ground, name)) for name, bound in BELOW.items()]

@@ -3,26 +3,20 @@
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 
-from cairn_client.robot.layer_places import LayerPlaces
 from cairn_client.robot.layered_robot import LayeredRobot
+from cairn_fusion.recording.scan import Scan
 from cairn_map.epochs.layer import EVIDENCE
 from cairn_map.errors import UnreachableError
+from cairn_map.wire.layer_messages import BoxM, MappedLayer
 from cairn_sim.robots.record import Plan, places_of, scans_of, shots_of
 
 GROUND = "ground"
 """The layer of the yard: a level."""
-PLACES = LayerPlaces(
-    boxes=MappingProxyType(
-        {
-            EVIDENCE: (((-15.1, 3.9, -1.3), (-10.9, 7.1, 1.6)),),
-            # In the doorway a robot maps into both, so that the two meet.
-            GROUND: (((-11.8, 4.9, -1.3), (-10.9, 6.1, 1.6)),),
-        }
-    ),
-    elsewhere=(GROUND,),
-)
+SHED: BoxM = ((-15.1, 3.9, -1.3), (-10.9, 7.1, 1.6))
+INNER: BoxM = ((-15.1, 3.9, -1.3), (-11.8, 7.1, 1.6))
+"""The shed without its doorway, in which a robot maps into both layers, so that the two meet."""
+CONTRIBUTES = (MappedLayer(layer=EVIDENCE, inside_m=SHED), MappedLayer(layer=GROUND, outside_m=INNER))
 """The shed of the yard is mapped as evidence, all else as a level."""
 
 
@@ -52,7 +46,7 @@ class YardRobot:
             map_url,
             directory=folder / name,
             name=name,
-            contributes=PLACES.layers,
+            contributes=CONTRIBUTES,
             stay=True,
             times="recorded",  # the scene's time is not this machine's
         )
@@ -64,12 +58,12 @@ class YardRobot:
             CairnError: as `LayeredRobot.commit` and `sync`.
         """
         for shot, scan, _ in self._scans:
-            into = PLACES.layers_at(scan.T_map_rig)
+            into = layers_at(scan)
             self.progress.place = (
                 "in the door" if len(into) > 1 else ("in the shed" if EVIDENCE in into else "outdoors")
             )
             # A commit of its own where an epoch ends amid the scans of a stop.
-            self.progress.commits += len(self.robot.observe(scan, into=into))
+            self.progress.commits += len(self.robot.observe(scan))
             if shot.ends_stop:
                 break
         else:
@@ -92,3 +86,9 @@ class YardRobot:
         """Close the robot's directories."""
         self._scans.close()
         self.robot.close()
+
+
+def layers_at(scan: Scan) -> tuple[str, ...]:
+    """Layers that the robots map into from the place of a scan."""
+    x, y, z = scan.T_map_rig[:3, 3].tolist()
+    return tuple(each.layer for each in CONTRIBUTES if each.takes((x, y, z)))

@@ -48,7 +48,7 @@ class Profile(StrEnum):
     """Coding of the streams; both profiles hold the same evidence, and have the same digest."""
 
     FAST = "fast"
-    """Byte planes under zstd."""
+    """Byte planes under zstd; of a level, the votes under a model, which knows that their weights are mostly hits."""
     SMALL = "small"
     """Each number under a model of its neighbours: six tenths of the bytes for some ten times the time."""
 
@@ -96,22 +96,28 @@ def encode_cell(
     """
     # The canonical streams, over which the digest is taken (FORMAT.md sections 4 and 5), each under zstd.
     check_fits(evidence, geometry)
-    plain = plain_bytes(key, evidence, geometry) if Profile(profile) is Profile.FAST else None
-    if plain is not None:
+    profile = Profile(profile)
+    plain = plain_bytes(key, evidence, geometry) if profile is Profile.FAST else None
+    if plain is not None and not geometry.is_flat:
         return EncodedCell(bytes(plain.head) + join_streams(stored_streams(plain.streams)), _digest(plain.canonical))
     signed, content = evidence.is_signed, content_of(evidence, geometry)
     parts = channel_streams.split_samples(content.sampled, content.samples, geometry)
-    head, streams = _canonical(key, content, parts, geometry, voxels=len(evidence), signed=signed)
+    streams: Mapping[int, bytes | memoryview]
+    canonical: bytes | memoryview
+    if plain is not None:
+        head, streams, canonical = bytes(plain.head), plain.streams, plain.canonical
+    else:
+        head, raw = _canonical(key, content, parts, geometry, voxels=len(evidence), signed=signed)
+        streams, canonical = raw, canonical_bytes(head, raw)
     stored = {stream.number: stream for stream in stored_streams(streams)}
     # Groups that a model makes shorter take the place of theirs (section 14): all bytes in the first stream.
-    if Profile(profile) is Profile.SMALL and not signed:
-        for first, data in _modelled(content, parts, geometry).items():
-            group = [number for number in streams if _group(number) == _group(first)]
-            if data is not None and len(data) < sum(len(stored[number].body) for number in group):
-                for number in group:
-                    body = data if number == first else b""
-                    stored[number] = StoredStream(number, MODELLED, len(streams[number]), body)
-    return EncodedCell(head + join_streams(list(stored.values())), _digest(canonical_bytes(head, streams)))
+    for first, data in ({} if signed else _modelled(content, parts, geometry, profile)).items():
+        group = [number for number in streams if _group(number) == _group(first)]
+        if data is not None and len(data) < sum(len(stored[number].body) for number in group):
+            for number in group:
+                body = data if number == first else b""
+                stored[number] = StoredStream(number, MODELLED, len(streams[number]), body)
+    return EncodedCell(head + join_streams(list(stored.values())), _digest(canonical))
 
 
 def encode_empty_cell(key: CellKey, geometry: Geometry) -> bytes:
@@ -252,14 +258,21 @@ def _canonical(
     return encode_head(head), streams
 
 
-def _modelled(content: CellContent, parts: list[ChannelRows], geometry: Geometry) -> dict[int, bytes | None]:
-    """By the number of its first stream: the bytes of each group under its model; None where they would be longer."""
+def _modelled(
+    content: CellContent, parts: list[ChannelRows], geometry: Geometry, profile: Profile
+) -> dict[int, bytes | None]:
+    """By the number of its first stream: the bytes of each group under its model; None where they would be longer.
+
+    All groups in the profile *small*, those of channels in the profile *fast* of a level, none in that of other cells.
+    """
     leaves = len(content.counts)
+    if profile is Profile.FAST and not (geometry.is_flat and leaves):
+        return {}
     ground = small_profile.ground_of(content.octree, depth=geometry.depth)
-    groups = {
-        CHILD_MASKS: small_profile.encode_masks(content.octree, depth=geometry.depth),
-        HITS: small_profile.encode_counts(content, ground),
-    }
+    groups: dict[int, bytes | None] = {}
+    if profile is Profile.SMALL:
+        groups[CHILD_MASKS] = small_profile.encode_masks(content.octree, depth=geometry.depth)
+        groups[HITS] = small_profile.encode_counts(content, ground)
     # A channel is modelled on the weights of the channel before it.
     hits, before = content.counts[:, 0].copy(), np.zeros(leaves, np.int64)
     for c, (channel, rows) in enumerate(zip(geometry.channels, parts, strict=True)):

@@ -19,14 +19,16 @@ from cairn_map.epochs.cell_history import CellHistory, cell_history
 from cairn_map.epochs.epoch import BASE, Epoch, begin_s, times_of_epochs
 from cairn_map.epochs.layer import MapLayer
 from cairn_map.epochs.present import (
+    JOINED_MIN,
     ReadCounts,
     ShownSamples,
     counts_of_rows,
+    joined_samples,
     present,
     present_of_rows,
     voxels_of_rows,
 )
-from cairn_map.epochs.present_kernels import JOINED_MIN, number_words_into
+from cairn_map.epochs.present_kernels import number_words_into
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.brick_cell import BrickCell, reading_cell
 from cairn_map.evidence.brick_counts import BrickCounts
@@ -320,12 +322,12 @@ def _joinable(
     at_rows = [row.voxels[row.sampled] for row in rows]
     sampled = np.unique(np.concatenate([np.empty(0, np.uint32), *at_rows]))
     free_after = counts.free_after[np.searchsorted(voxels, sampled)]
-    enough = np.zeros((len(sampled), len(weights)), np.int64)
+    enough, joined = np.zeros((len(sampled), len(weights)), np.int64), joined_samples(geometry)
     found = []
     for number, (row, at) in reversed(list(enumerate(zip(rows, at_rows, strict=True)))):
         places, mine = np.searchsorted(sampled, at), row.samples[:, weights]
         # With as many samples as are joined, older ones are of no account; nor is what was seen through since.
-        needed = ((mine > 0) & (enough[places] < JOINED_MIN)).any(axis=1) & (number >= free_after[places])
+        needed = ((mine > 0) & (enough[places] < joined)).any(axis=1) & (number >= free_after[places])
         enough[places] += np.minimum(mine, JOINED_MIN)
         if needed.any():
             found.append(_Samples.of_sums(at[needed], row.samples[needed]))

@@ -6,6 +6,7 @@ So a wall that was seen 200 times is gone after nine misses of a later epoch, as
 does not depend on the order in which the rows came. A history of one row reads as that row under the sensor model.
 
 Samples are not averaged over all times: the newest row's are shown, and older ones only where they are few and agree.
+Votes for the heights of a level are the exception: of all times, for a column is read from the shares of its bins.
 """
 
 from collections.abc import Sequence
@@ -20,7 +21,7 @@ from cairn_map.epochs.cell_history import CellHistory
 from cairn_map.epochs.epoch import BASE, Epoch, times_of_epochs
 from cairn_map.epochs.layer import MapLayer
 from cairn_map.epochs.present_kernels import add_counts_into, join_samples_into
-from cairn_map.evidence.channels import ChannelKind, planes_and_squares
+from cairn_map.evidence.channels import HEIGHT_OFFSET, ChannelKind, planes_and_squares
 from cairn_map.evidence.evidence import COUNT_MAX, Evidence, empty_evidence
 from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel, log_odds
@@ -35,6 +36,8 @@ SAMPLE_SIGMA = {
 """Standard deviation of one sample, in the channel's unit: sRGB steps of a textured surface, kelvin of an uncooled
 camera. 0: unknown, so that only equal means are joined."""
 
+JOINED_MIN = 8
+"""Samples up to which older rows that agree are joined."""
 FEW = 256
 """Share of a cell's voxels, as one of so many, below which sorting them is faster than a table of all."""
 
@@ -156,14 +159,23 @@ def counts_of_rows(voxels: npt.NDArray[np.uint32], rows: Sequence[Evidence], mod
     return found
 
 
+def joined_samples(geometry: Geometry) -> npt.NDArray[np.int64]:
+    """(C,) samples of each channel up to which older rows are joined: of a level's heights without end."""
+    endless = [geometry.is_flat and channel == HEIGHT_OFFSET for channel in geometry.channels]
+    return np.where(endless, np.iinfo(np.int64).max, JOINED_MIN).astype(np.int64)
+
+
 class ShownSamples:
     """Samples of V voxels that rule R4 shows."""
 
-    __slots__ = ("_done", "_sigma", "_spec", "newest", "samples")
+    __slots__ = ("_done", "_joined", "_sigma", "_spec", "newest", "samples")
 
     def __init__(self, voxels: int, geometry: Geometry) -> None:
         channels = geometry.channels
-        self._spec = planes_and_squares(channels)
+        self._spec, self._joined = planes_and_squares(channels), joined_samples(geometry)
+        if geometry.is_flat:  # votes, as those for classes
+            self._spec = self._spec.copy()
+            self._spec[[channel == HEIGHT_OFFSET for channel in channels], 2] = 1
         self._sigma = np.array([SAMPLE_SIGMA[channel.kind] / channel.step for channel in channels], np.float64)
         self._done = np.zeros((voxels, len(channels)), np.bool_)
         self.samples = np.zeros((voxels, geometry.plane_count), np.int64)
@@ -195,6 +207,7 @@ class ShownSamples:
             number,
             self._spec,
             self._sigma,
+            self._joined,
             free_after,
             self.samples,
             self.newest,

@@ -11,8 +11,6 @@ import numpy.typing as npt
 
 ALONE_MIN = 3
 """Samples from which on the newest row is read alone."""
-JOINED_MIN = 8
-"""Samples up to which older rows that agree are joined."""
 GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 """2^64 over the golden ratio."""
 AGREE_SIGMA = 3.0
@@ -71,6 +69,7 @@ def join_samples_into(
     row: int,
     spec: npt.NDArray[np.int64],
     sigma: npt.NDArray[np.float64],
+    joined: npt.NDArray[np.int64],
     free_after: npt.NDArray[np.int32],
     samples: npt.NDArray[np.int64],
     newest: npt.NDArray[np.int32],
@@ -83,8 +82,9 @@ def join_samples_into(
         row_voxels: (S,) voxels of the row that have samples.
         row_samples: (S, P) their sums.
         row: number of the row.
-        spec: (C, 3) planes of each channel, how many of them are squares, and whether they are votes for classes.
+        spec: (C, 3) planes of each channel, how many of them are squares, and whether they are votes.
         sigma: (C,) standard deviation of one sample, in steps of the channel.
+        joined: (C,) samples up to which older rows are joined.
         free_after: (V,) number of the newest row after which the voxel read free; older samples are not shown.
         samples: (V, P) sums shown, changed.
         newest: (V, C) number of the newest row with samples; -1: none; changed.
@@ -104,7 +104,7 @@ def join_samples_into(
             w, held = row_samples[n, weight], samples[at, weight]
             if w != 0 and not done[at, c]:
                 # R4: the newest row is shown in any case, an older one if all means agree within the error of both.
-                # Votes for classes are joined up to as many, whether they agree or not: they are counts, not means.
+                # Votes are joined up to as many, whether they agree or not: they are counts, not means.
                 agrees = True
                 if held != 0 and spec[c, 2] == 0:
                     bound = AGREE_SIGMA * sigma[c] * np.sqrt(1.0 / w + 1.0 / held)
@@ -116,7 +116,7 @@ def join_samples_into(
                 if agrees:
                     for p in range(first, weight + 1):
                         samples[at, p] += row_samples[n, p]
-                enough = JOINED_MIN if held != 0 or spec[c, 2] != 0 else ALONE_MIN
+                enough = joined[c] if held != 0 or spec[c, 2] != 0 else ALONE_MIN
                 done[at, c] = not agrees or samples[at, weight] >= enough
             first = weight + 1
 

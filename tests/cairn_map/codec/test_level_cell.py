@@ -4,19 +4,31 @@ import json
 from contextlib import suppress
 from dataclasses import replace
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.fixtures.map.made import random_evidence
 
-from cairn_map.codec.cell_code import Profile, decode_canonical_cell, decode_cell, encode_cell
+from cairn_map.codec.cell_code import (
+    Profile,
+    decode_canonical_cell,
+    decode_cell,
+    encode_cell,
+    encode_empty_cell,
+    recompressed_cell,
+)
+from cairn_map.codec.cell_reading import cell_reader
 from cairn_map.codec.history_code import check_canonical_history, decode_history, encode_history
 from cairn_map.codec.octree.cell_head import HEIGHT_STEP
+from cairn_map.codec.octree.streams import MODELLED, join_streams, stored_streams
+from cairn_map.codec.plain_cell import plain_bytes
 from cairn_map.epochs.cell_history import cell_history
 from cairn_map.epochs.epoch import BASE, Epoch
 from cairn_map.epochs.layer import LayerDefinition, MapLayer
 from cairn_map.errors import CairnError
 from cairn_map.evidence.channels import HEIGHT_OFFSET
+from cairn_map.evidence.evidence import Evidence, empty_evidence, packed_evidence
 from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.fingerprint import fingerprint
 from cairn_map.evidence.grid import Geometry, cell_key, geometry_for, level_geometry
@@ -34,7 +46,48 @@ def test_a_cell_is_read_as_it_was_written_and_is_longer_than_one_of_cubes_by_the
     assert (found.key, found.geometry, found.evidence, found.digest) == (KEY, LEVEL, evidence, flat.digest)
     assert flat.data[:5] + b"\1" + flat.data[6:34] == cubes.data[:34]
     assert flat.data[34:38] == HEIGHT_STEP.pack(50_000)
-    assert flat.data[38:] == cubes.data[34:]
+    raw, raw_of_cubes = (
+        {number: stream.raw() for number, stream in cell_reader(cell.data).stored.items() if stream.coding != MODELLED}
+        for cell in (flat, cubes)
+    )
+    assert raw.items() <= raw_of_cubes.items()
+
+
+def votes(seed: int) -> Evidence:
+    """Votes as scans give them: of nearly all voxels the weight is the hits."""
+    rng = np.random.default_rng(seed)
+    hits = rng.integers(1, 9, 300)
+    weights = np.where(rng.random(300) < 0.1, 0, hits)
+    samples = np.stack([rng.integers(0, 10 * weights + 1), weights], axis=1)
+    places = np.sort(rng.choice(8**LEVEL.depth, 300, replace=False))
+    counts = np.stack([hits, rng.integers(0, 2, 300)], axis=1).astype(np.int32)
+    return packed_evidence(places, counts, samples, LEVEL)
+
+
+def test_votes_are_modelled_in_both_profiles_and_bytes_from_before_are_read() -> None:
+    evidence = votes(3)
+    plain = plain_bytes(KEY, evidence, LEVEL)
+    assert plain is not None
+    before = bytes(plain.head) + join_streams(stored_streams(plain.streams))
+    fast, small = (encode_cell(KEY, evidence, LEVEL, profile=profile) for profile in Profile)
+    assert len(small.data) < len(fast.data) < len(before)
+    codings = {number: stream.coding == MODELLED for number, stream in cell_reader(fast.data).stored.items()}
+    assert codings == {1: False, 2: False, 3: False, 4: False, 16: True, 17: True, 18: True}
+    for data in (before, fast.data, small.data):
+        found = decode_canonical_cell(data)
+        assert (found.evidence, found.digest) == (evidence, fast.digest)
+    assert recompressed_cell(before, profile=Profile.FAST) == fast.data
+    cubes = encode_cell(KEY, evidence, CUBES)
+    assert not any(stream.coding == MODELLED for stream in cell_reader(cubes.data).stored.values())
+
+
+def test_differences_and_empty_cells_are_not_modelled() -> None:
+    evidence = votes(3)
+    signed = replace(evidence, counts=-evidence.counts, samples=-evidence.samples)
+    coded = encode_cell(KEY, signed, LEVEL)
+    assert not any(stream.coding == MODELLED for stream in cell_reader(coded.data).stored.values())
+    assert decode_cell(coded.data).evidence == signed
+    assert encode_empty_cell(KEY, LEVEL) == encode_cell(KEY, empty_evidence(LEVEL), LEVEL).data
 
 
 def test_rows_of_epochs_too() -> None:

@@ -14,37 +14,41 @@ from cairn_map.epochs.epoch import BASE, Epoch
 from cairn_map.epochs.history_map import HistoryMap
 from cairn_map.epochs.present import present
 from cairn_map.evidence.brick_cell import reading_cell
+from cairn_map.evidence.channels import HEIGHT_OFFSET
 from cairn_map.evidence.evidence import COUNT_MAX, Evidence, packed_evidence
+from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 
 MODEL = SensorModel()
+LEVEL = Geometry(voxel_edge_um=200_000, height_step_um=50_000, depth=3, channels=(HEIGHT_OFFSET,))
+"""Its votes are joined over all epochs."""
 
 
 def expected(rows: HistoryMap, *, at: Epoch | None = None) -> Evidence:
     """The reading of all rows, as a cell gives it back."""
-    reading = present(rows.history(KEY), SMALL, MODEL, at=at).evidence
-    return reading_cell(SMALL, reading, MODEL).packed()
+    reading = present(rows.history(KEY), rows.geometry, MODEL, at=at).evidence
+    return reading_cell(rows.geometry, reading, MODEL).packed()
 
 
-def alike(seed: int) -> Evidence:
+def alike(seed: int, geometry: Geometry = SMALL) -> Evidence:
     """Evidence of the same few voxels, with samples so few and so alike that rows are often joined."""
     rng = np.random.default_rng(seed)
     places = np.flatnonzero(rng.random(40) < 0.6).astype(np.uint32)
-    samples = np.zeros((len(places), SMALL.plane_count), np.int64)
-    for channel in SMALL.channels:
+    samples = np.zeros((len(places), geometry.plane_count), np.int64)
+    for channel in geometry.channels:
         weights = rng.integers(0, 4, len(places))
         values = 100 + rng.integers(0, 2, (len(places), channel.value_count)) * rng.choice([1, 60], p=[0.9, 0.1])
         columns = [values[:, n] * weights for n in range(channel.value_count)]
         columns += [values[:, 0] ** 2 * weights] if "square_sum" in channel.planes else []
-        samples[:, SMALL.planes_of(channel.name)] = np.stack([*columns, weights], axis=1)
-    return packed_evidence(places, rng.integers(0, 3, (len(places), 2)), samples, SMALL)
+        samples[:, geometry.planes_of(channel.name)] = np.stack([*columns, weights], axis=1)
+    return packed_evidence(places, rng.integers(0, 3, (len(places), 2)), samples, geometry)
 
 
-@given(st.integers(0, 10**6), st.sampled_from([None, 2, 3]))
-def test_whatever_changes_the_reading_is_that_of_all_rows(seed: int, at: int | None) -> None:
+@given(st.integers(0, 10**6), st.sampled_from([None, 2, 3]), st.sampled_from([SMALL, LEVEL]))
+def test_whatever_changes_the_reading_is_that_of_all_rows(seed: int, at: int | None, geometry: Geometry) -> None:
     rng, until = random.Random(seed), None if at is None else Epoch(at)
-    rows = epoch_map()
-    reading = CellReading(SMALL, MODEL, lambda: rows.rows(KEY), at=until)
+    rows = epoch_map(geometry)
+    reading = CellReading(geometry, MODEL, lambda: rows.rows(KEY), at=until)
     commits: list[tuple[Epoch, Evidence]] = []
     for n in range(14):
         # Mostly the newest epoch grows; at times old news comes, a commit is taken back, or a new epoch begins.
@@ -53,7 +57,8 @@ def test_whatever_changes_the_reading_is_that_of_all_rows(seed: int, at: int | N
             (epoch, diff), sign = commits.pop(rng.randrange(len(commits))), -1
         else:
             epoch = Epoch(n // 4) if kind < 0.8 else rng.choice([BASE, Epoch(0), Epoch(n // 5)])
-            diff, sign = rng.choice([alike, lambda it: random_evidence(it, SMALL, voxels=20)])(rng.randrange(10**6)), 1
+            make = rng.choice([alike, lambda seed, grid: random_evidence(seed, grid, voxels=20)])
+            diff, sign = make(rng.randrange(10**6), geometry), 1
             commits.append((epoch, diff))
         change(rows, epoch, diff, sign=sign)
         reading.note(epoch, diff, sign)

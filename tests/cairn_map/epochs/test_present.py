@@ -13,12 +13,16 @@ from tests.naive import history as naive_history
 from cairn_map.epochs.cell_history import CellHistory, cell_history, merged
 from cairn_map.epochs.epoch import BASE, Epoch
 from cairn_map.epochs.present import Present, present
+from cairn_map.evidence.brick_cell import BrickCell
+from cairn_map.evidence.channels import HEIGHT_OFFSET
 from cairn_map.evidence.evidence import Evidence, empty_evidence, packed_evidence
+from cairn_map.evidence.grid import Geometry
 from cairn_map.evidence.inverse_sensor_model import SensorModel, log_odds
 
 MODEL = SensorModel()
 HIT, MISS, LOW, HIGH = (log_odds(p) for p in (MODEL.p_hit, MODEL.p_miss, MODEL.p_min, MODEL.p_max))
 PLACE = 7
+LEVEL = Geometry(voxel_edge_um=200_000, height_step_um=50_000, depth=3, channels=(HEIGHT_OFFSET,))
 COLOUR, INTENSITY, TEMPERATURE, DOSE = (SMALL.planes_of(channel.name) for channel in SMALL.channels)
 """Columns of the channels of `SMALL`."""
 
@@ -148,3 +152,24 @@ def test_samples_from_before_the_voxel_read_free_are_not_shown() -> None:
     reading = read(crate_came_and_went)
     assert reading.occupied(MODEL)[0]
     assert len(reading.sampled) == 0
+
+
+@given(st.integers(0, 10**6), st.integers(2, 5))
+def test_votes_of_a_level_count_in_all_epochs_unless_they_were_seen_through_since(seed: int, count: int) -> None:
+    # Many votes in one epoch, few in another, of other heights: a column is read from the shares of its bins.
+    rng = np.random.default_rng(seed)
+    rows = {}
+    for epoch in range(count):
+        places = np.flatnonzero(rng.random(30) < 0.5).astype(np.uint32)
+        votes = rng.integers(1, 20, len(places))
+        samples = np.stack([rng.integers(0, 10 * votes), votes], axis=1)
+        rows[Epoch(epoch)] = packed_evidence(places, np.stack([votes, 0 * votes], axis=1), samples, LEVEL)
+    whole = present(cell_history(rows), LEVEL, MODEL)
+    total = BrickCell(LEVEL)
+    for row in rows.values():
+        total.merge(row)
+    assert whole.samples.tolist() == total.packed().samples.tolist()
+    seen_through = total.packed().voxels[:1]
+    misses = packed_evidence(seen_through, np.array([[0, 60]]), np.zeros((1, 2), np.int64), LEVEL)
+    later = present(cell_history(rows | {Epoch(count): misses}), LEVEL, MODEL)
+    assert later.samples.tolist() == total.packed().samples.tolist()[1:]
