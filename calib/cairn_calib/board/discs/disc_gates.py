@@ -52,8 +52,8 @@ GROUND_SAMPLES, NEAR_RADII, NEAR_STEPS = 7, 1.1, 0.08
 DARK_LEAST, DARK_MOST, DARK_DISCS = 0.06, 0.2, 0.5
 """Share of the ground between four discs that may be as dark as they are: that of half a disc, within bounds."""
 ALIKE, ALONE = 0.3, 0.35
-"""Of what counts as one more disc beyond a board's rim: the largest difference from its discs, and the least from each
-place half-way to a neighbour, contrasts."""
+"""Largest difference from a board's discs of what counts as one more beyond its rim, and the least from each place
+half-way to a neighbour, contrasts."""
 OUTER_SHARE = 0.25
 """Share of the places next to a board's rim, wholly in view, that may have one; clutter is at some."""
 DISC_PITCHES = (0.25, 1.0)
