@@ -357,7 +357,7 @@ class LayeredRobot:
 
         A layer whose grid cannot be asked for now is opened later; the first time, that is the caller's error.
         """
-        wanted = {each.layer: MAPS for each in self._wanted.contributes}
+        wanted: dict[str, Mode] = {each.layer: MAPS for each in self._wanted.contributes}
         wanted |= dict.fromkeys(self._wanted.fetches, READS)
         for layer, robot in list(self._robots.items()):
             if wanted.get(layer) == self._roles[layer]:

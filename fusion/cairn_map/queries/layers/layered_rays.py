@@ -74,15 +74,16 @@ def cast_layers(
             next_m[index, stale] = _next_m(layer, origins[stale], units[stale], at_m[stale], max_range_m)
         which = next_m[:, rows].argmin(axis=0)
         found_m = next_m[which, rows]
-        rows, which, found_m = (each[np.isfinite(found_m)] for each in (rows, which, found_m))
+        is_met = np.isfinite(found_m)
+        rows, which, found_m = rows[is_met], which[is_met], found_m[is_met]
         # Just inside that voxel, the finest layer that knows the point answers.
         inside = origins[rows] + units[rows] * (found_m + step_m)[:, None]
         answering, states = _answers(frozen, inside, which)
         is_end = states == State.OCCUPIED
         ends_m[rows[is_end]], of_layer[rows[is_end]] = found_m[is_end], answering[is_end]
         # Free there: on to where the ray leaves the finer voxel.
-        rows, inside, answering, found_m = (each[~is_end] for each in (rows, inside, answering, found_m))
-        at_m[rows] = found_m + 2 * step_m + _way_out_m(frozen, answering, inside, units[rows])
+        rows, found_m = rows[~is_end], found_m[~is_end]
+        at_m[rows] = found_m + 2 * step_m + _way_out_m(frozen, answering[~is_end], inside[~is_end], units[rows])
         rows = rows[at_m[rows] <= max_range_m]
     points = origins + units * np.where(np.isfinite(ends_m), ends_m, np.nan)[:, None]
     return LayeredEnds(ends_m, points, of_layer, names)
