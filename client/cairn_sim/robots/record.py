@@ -24,7 +24,7 @@ import json
 import math
 import os
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -194,7 +194,7 @@ def _scan_times_s(plan: Plan, *, per_visit: int, count: int) -> list[float]:
 
 def scans_of(
     plan: Plan, shots: Sequence[Shot], rig: Rig, *, threads: int | None = None
-) -> Iterator[tuple[Shot, Scan, dict[str, CameraTruth]]]:
+) -> Generator[tuple[Shot, Scan, dict[str, CameraTruth]], None, None]:
     """Each shot with its scan and the truth behind its images, in order; rendered side by side (None: on all cores).
 
     At most `AHEAD` scans a thread are held, however many there are.
