@@ -162,7 +162,7 @@ def drive_team(team: Sequence[YardRobot], api: MapApi, console: Console) -> None
 
 def _table(team: Sequence[YardRobot]) -> Table:
     table = Table(box=SIMPLE_HEAD, pad_edge=False)
-    for title in ("robot", "place", "stops", "commits", "up", "down", *(f"{layer} cells" for layer in LAYERS)):
+    for title in ("robot", "place", "stops", "up", "down", *LAYERS):
         table.add_column(title, no_wrap=True, justify="left" if title in ("robot", "place") else "right")
     for member in team:
         now = member.progress
@@ -170,10 +170,9 @@ def _table(team: Sequence[YardRobot]) -> Table:
             member.name,
             now.place,
             f"{now.stops}/{member.stop_count}",
-            str(now.commits),
             shown_bytes(now.up_bytes),
             shown_bytes(now.down_bytes),
-            *(str(len(member.robot.robots[layer].map)) for layer in LAYERS),
+            *(f"{len(member.robot.robots[layer].map)} cells" for layer in LAYERS),
         )
     return table
 
