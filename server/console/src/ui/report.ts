@@ -128,7 +128,7 @@ function proof({ name }: MapInfo, { cursor, digest }: MapDigest): HTMLElement {
   // Page after page: an empty one ends the index.
   const command = [
     "last=",
-    `while page=$(curl -sf -H 'Cairn-Format: 4' -H "Authorization: Bearer $CAIRN_TOKEN" "${url}$last") &&`,
+    `while page=$(curl -sSf -H 'Cairn-Format: 4' -H "Authorization: Bearer $CAIRN_TOKEN" "${url}$last") &&`,
     `    lines=$(printf %s "$page" | jq -r '.cells[] | "\\(.cell | join(",")) \\(.digest)"') && [ -n "$lines" ]`,
     `do printf '%s\\n' "$lines"; last="&after=$(printf '%s\\n' "$lines" | tail -n 1 | cut -d ' ' -f 1)"; done | sha256sum`,
   ].join("\n");
