@@ -11,7 +11,7 @@ from tests.fixtures.fusion.drive_mapping import TOPICS
 from tests.fixtures.fusion.live_drive import bag_message, drive
 
 from cairn_calib.rig.rig import Rig
-from cairn_client.live.live_mapping import BEHIND_S, REST_S, LiveMapping
+from cairn_client.live.live_mapping import REST_S, LiveMapping
 from cairn_client.replica.limits import Limits
 from cairn_client.robot.robot import Robot
 from cairn_client.sync.responses import TimeSample
@@ -73,7 +73,8 @@ def test_a_robot_slower_than_its_cameras_maps_the_newest_and_counts_the_rest(dri
         driven.step(messages)
         if driven.live.taken:
             ages_s.append(driven.scans.last_s - driven.live.newest_s)
-    assert max(ages_s) <= BEHIND_S + 1.0
+    # With its own mapping, a third of a second here, each scan is in the map within a second of its image.
+    assert max(ages_s) + 1 / 3 < 1.0
     assert driven.live.waiting <= 20
     driven.live.finish()
     driven.check_account()

@@ -75,7 +75,8 @@ def test_messages_that_the_network_lost_are_counted() -> None:
             source.close()
 
 
-def test_without_a_router_it_says_how_to_start_one() -> None:
+def test_without_a_router_it_says_how_to_start_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cairn_client.links.zenoh_link.CONNECT_S", 0.1)
     source = open_door("zenoh://127.0.0.1:9")
     with pytest.raises(BadInputError, match="ros2 run rmw_zenoh_cpp rmw_zenohd") as caught:
         source.open(lambda topic: True)

@@ -140,7 +140,10 @@ def test_a_door_of_ours_finds_what_is_published(robot: ZenohRobot) -> None:
             source.close()
 
 
-def test_what_is_no_router_is_said_before_anything_is_published(server: LiveServer, tmp_path: Path) -> None:
+def test_what_is_no_router_is_said_before_anything_is_published(
+    server: LiveServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cairn_client.links.zenoh_link.CONNECT_S", 0.1)
     with pytest.raises(BadInputError, match="ros2 run rmw_zenoh_cpp rmw_zenohd"):
         main(["publish", server.map_url, "--zenoh=zenoh://127.0.0.1:9", f"--mcap={tmp_path / 'a.mcap'}"])
     with pytest.raises(BadInputError, match="zenoh://HOST:PORT"):
