@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.fixtures.client.made import cells_of
 from tests.fixtures.client.world import MODES, PUSHES, Fault, World, quick
+from tests.fixtures.lengths import length
 
 Step = Callable[[World], None]
 
@@ -48,7 +49,7 @@ def no_flush_and_no_threads() -> object:
 
 
 @pytest.mark.slow
-@settings(max_examples=100)
+@settings(max_examples=length(50, long=100))
 @given(histories)
 def test_after_any_history_all_maps_are_equal_and_no_commit_is_lost(history: list[tuple]) -> None:  # type: ignore[type-arg]
     with tempfile.TemporaryDirectory() as folder, World(Path(folder)) as world:

@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from tests.fixtures.client.hostile_server import END, HostileServer, forwarded
 from tests.fixtures.client.live_server import LiveServer
 from tests.fixtures.client.made import GEOMETRY, MAP, A, cells_of, cursor, opened, random_diff, seen
+from tests.fixtures.lengths import length
 
 from cairn_client.http.api import MapApi
 from cairn_client.http.http_link import Link, index_of
@@ -187,7 +188,7 @@ def all_asked(api: MapApi, replica: Replica, name: str, *, is_low_end: bool) -> 
 
 
 @pytest.mark.slow
-@settings(max_examples=20)
+@settings(max_examples=length(10, long=20))
 @given(
     plan=st.lists(st.one_of(st.none(), damages(), st.just("older")), min_size=1, max_size=6), is_low_end=st.booleans()
 )

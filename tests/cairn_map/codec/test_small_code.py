@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.fixtures.lengths import length
 from tests.fixtures.map.made import (
     DOSE,
     GEOMETRIES,
@@ -45,6 +46,7 @@ def full_evidence(geometry: Geometry) -> Evidence:
 
 
 @pytest.mark.slow
+@settings(max_examples=length(25, long=50))
 @given(st.one_of(RANDOM, SMOOTH))
 def test_the_twin_reads_and_writes_the_same_bytes(made: Made) -> None:
     evidence, geometry = made
@@ -59,6 +61,7 @@ def test_the_twin_reads_and_writes_the_same_bytes(made: Made) -> None:
 
 
 @pytest.mark.slow
+@settings(max_examples=length(25, long=50))
 @given(st.one_of(EXTREME, RANDOM))
 def test_what_the_twin_writes_of_anything_is_read(made: Made) -> None:
     """Evidence with extremes, which the real encoder finds no shorter than they are and leaves raw."""

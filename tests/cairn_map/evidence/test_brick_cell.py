@@ -4,8 +4,9 @@ from contextlib import suppress
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.fixtures.lengths import length
 from tests.fixtures.map.made import DOSE, GEOMETRIES, KEY, MIDDLE, PLAIN, SMALL, any_evidence, as_dict, random_evidence
 from tests.naive import evidence as naive_evidence
 
@@ -93,6 +94,7 @@ def test_numbers_of_any_size_are_summed_or_refused_as_the_twin_says(steps: list[
 
 
 @pytest.mark.slow
+@settings(max_examples=length(25, long=50))
 @given(st.lists(st.tuples(st.integers(0, 1000), st.sampled_from([1, -1])), max_size=5))
 def test_bricks_and_runs_and_rows_are_summed_as_the_twin_says(steps: list[tuple[int, int]]) -> None:
     cell, total = BrickCell(MIDDLE), naive_evidence.Evidence()
