@@ -113,8 +113,7 @@ def code_number(
     if not zero:
         negative, live = code_mixed(live, data, odds, contexts, 1, weights, row + 1, 1 if number < 0 else 0)
         found, live = _code_magnitude(live, data, odds, contexts, weights, row, tails, tail, abs(number))
-    # One way out, at which every array is named: else references to them are counted here, atomically, which takes as
-    # long as all the rest.
+    # One way out, at which every array is named: else the compiler counts references to them here, for each number.
     _ = data.shape, odds.shape, weights.shape, tails.shape
     return (-found if negative else found), live
 
