@@ -101,7 +101,7 @@ def _hard_ground_rows(smoke: bool) -> Iterator[Row]:
     found |= {bound: ground_errors_below(scene, ground, name) for name, bound in BELOW.items()}
     for bound, errors in found.items():
         yield (
-            f"ground {bound.place}, lidar: median error",
+            f"level, {bound.place}, lidar: median error",
             f"{1e3 * errors.median_m:.1f}",
             f"mm, largest {1e2 * errors.largest_m:.1f} cm, {errors.within_three:.1%} of {len(errors.error_m)} columns "
             "within 3 sigma",

@@ -83,8 +83,7 @@ def _errors(ground: Elevation, y: Ints, x: Ints, height_m: Floats) -> GroundErro
 
 
 def _middles(ground: Elevation, y: Ints, x: Ints) -> Floats:
-    along = (ground.origin_m[0] + x * ground.edge_m, ground.origin_m[1] + y * ground.edge_m)
-    return np.stack(along, axis=1, dtype=np.float64)
+    return np.asarray(ground.origin_m, np.float64) + ground.edge_m * np.stack([x, y], axis=1).astype(np.float64)
 
 
 def _heights(scene: Scene, ground: Elevation, y: Ints, x: Ints) -> tuple[Floats, Flags]:
