@@ -52,8 +52,8 @@ GROUND_SAMPLES, NEAR_RADII, NEAR_STEPS = 7, 1.1, 0.08
 DARK_LEAST, DARK_MOST, DARK_DISCS = 0.06, 0.2, 0.5
 """Share of the ground between four discs that may be as dark as they are: that of half a disc, within bounds."""
 ALIKE, ALONE = 0.3, 0.35
-"""Largest difference from a board's discs of what counts as one more beyond its rim, and the least from each place
-half-way to a neighbour, contrasts."""
+"""Largest difference from a board's discs of what counts as one more beyond its rim, and the least from the ground
+between four on each side, contrasts."""
 OUTER_SHARE = 0.25
 """Share of the places next to a board's rim, wholly in view, that may have one; clutter is at some."""
 DISC_PITCHES = (0.25, 1.0)
@@ -229,10 +229,11 @@ def rim_refusal(dark: Image, found: GridFit) -> tuple[str, str] | None:
     # Counts at discs, at the ground between four of them, half-way to each neighbour, and beyond the rim.
     near = (known[:, None] + sides).reshape(-1, 2)
     is_disc = (np.abs(near[:, None] - board.lattice()).max(axis=2) < 1e-6).any(axis=1)
-    ground = (known[:, None] + (sides + np.roll(sides, 1, axis=0)) / 2).reshape(-1, 2)
+    diagonals = (sides + np.roll(sides, 1, axis=0)) / 2
+    ground = (known[:, None] + diagonals).reshape(-1, 2)
     half_way = np.repeat(known, len(sides), axis=0)[is_disc] + np.tile(sides, (len(known), 1))[is_disc] / 2
     outer = np.unique(near[~is_disc], axis=0)
-    outside = (outer[:, None] + sides / 2).reshape(-1, 2)
+    outside = (outer[:, None] + diagonals).reshape(-1, 2)
     values = [
         _counts_at(dark, local_map(known, pixels, places, step=step)[0])
         for places in (known, ground, half_way, outer, outside)
