@@ -60,7 +60,7 @@ def test_ages_are_told_as_time_by_the_commits_own_clocks(console: Console, room:
     console.page.keyboard.press("Shift+5")
     legend = console.page.get_by_role("region", name="Legend")
     legend.get_by_text("before the newest measurement").wait_for()
-    unit = re.search(r"Age, (seconds|minutes)", legend.inner_text())
+    unit = re.search(r"Age by cell, (seconds|minutes)", legend.inner_text())
     assert unit
     highest = float(legend.get_by_label("Upper end").input_value()) * {"seconds": 1, "minutes": 60}[unit[1]]
     assert highest == pytest.approx(max(told.values()), abs=3)
