@@ -115,7 +115,8 @@ def _single_rows(snapshot: MapSnapshot, points: Floats, peer_s: float, repeats: 
             asked, answers = (ctypes.c_void_p(array.ctypes.data) for array in (points, states))
             own_s = loop(state, number, asked, ctypes.c_int64(len(points)), answers, repeats)
             alike = "alike" if (states == snapshot.state_at(points)).all() else "NOT ALIKE"
-            ratio = f"; OctoMap {1e6 * peer_s / len(points):.3f}: {peer_s / own_s:.1f} x as fast; answers {alike}"
+            peer = f"; OctoMap {1e6 * peer_s / len(points):.3f}: {peer_s / own_s:.1f} x as fast"
+            ratio = f"{peer if peer_s < np.inf else ''}; answers {alike}"
             what = f"  one point a call, from C, {len(points)}"
             yield what, f"{1e6 * own_s / len(points):.3f}", f"us CPU each{ratio}"
         from_python: dict[str, Callable[[], object]] = {

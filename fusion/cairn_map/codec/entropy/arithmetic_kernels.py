@@ -29,7 +29,7 @@ TOP = 0xFFFFFFFF
 EVEN = np.uint32(1 << 31)
 """Odds of a context that is not used yet: one half, seen 0 times."""
 SEEN_MAX = 255
-STEPS = np.array([(1 << 17) // (2 * n + 3) for n in range(SEEN_MAX + 1)], np.int64)
+STEPS = np.array([(1 << 17) // (2 * n + 3) for n in range(SEEN_MAX + 1)], np.int32)
 """By times seen: the fraction by which a probability moves towards the bit, in 1/65536: 2/3, 2/5, 2/7, ... at first a
 mean of all bits, later one that forgets the oldest."""
 
@@ -69,8 +69,9 @@ def suspend_into(coder: Coder, live: Live) -> None:
 def code_bit(live: Live, data: Data, odds: Odds, context: int, bit: int) -> tuple[int, Live]:
     """Code one bit under a context, and let the context learn it."""
     # At least 1/65536, else an interval could become empty.
-    bit, live = split(live, data, max(signed(odds[context]) >> 16, 1), 16, bit)
-    learn(odds, context, bit)
+    odd = signed(odds[np.uint64(context)])
+    bit, live = split(live, data, max(odd >> 16, 1), 16, bit)
+    odds[np.uint64(context)] = learnt(odd, bit)
     return bit, live
 
 
@@ -102,22 +103,22 @@ def split(live: Live, data: Data, chance: int, bits: int, bit: int) -> tuple[int
 
 
 @nb.njit(nogil=True, forceinline=True)
-def learn(odds: Odds, context: int, bit: int) -> None:
-    """Move a context's probability towards the bit that came."""
+def learnt(odd: int, bit: int) -> np.uint32:
+    """Odds of a context after a bit: its probability moves towards the bit."""
     # chance += (bit - chance) * step, in 22 bits.
-    odd = signed(odds[context])
     seen, chance = odd & 1023, odd >> 10
+    step = signed(STEPS[np.uint64(seen)])
     if bit:
-        chance += (((1 << 22) - 1 - chance) * STEPS[seen]) >> 16
+        chance += (((1 << 22) - 1 - chance) * step) >> 16
     else:
-        chance -= (chance * STEPS[seen]) >> 16
-    odds[context] = np.uint32((chance << 10) | min(seen + 1, SEEN_MAX))
+        chance -= (chance * step) >> 16
+    return np.uint32((chance << 10) | min(seen + 1, SEEN_MAX))
 
 
 @nb.njit(nogil=True, forceinline=True)
 def byte_at(data: Data, at: int) -> int:
     """A byte, or 0 behind the end."""
-    return signed(data[at]) if at < data.shape[0] else 0
+    return signed(data[np.uint64(at)]) if at < data.shape[0] else 0
 
 
 @nb.njit(cache=True, nogil=True)

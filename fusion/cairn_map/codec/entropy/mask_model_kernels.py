@@ -10,12 +10,11 @@ ones. Surfaces and borders of known space are smooth, so these predict most stat
 
 import numba as nb
 import numpy as np
-import numpy.typing as npt
 
 from cairn_map.arrays import Bytes
 from cairn_map.codec.entropy.arithmetic_kernels import EVEN, Coder, Data, resumed, suspend_into
-from cairn_map.codec.entropy.mixing_kernels import code_mixed, start_weights
-from cairn_map.codec.entropy.neighbour_kernels import LOWER, NONE, beside, stepped
+from cairn_map.codec.entropy.mixing_kernels import Opinions, U, code_mixed, start_weights
+from cairn_map.codec.entropy.neighbour_kernels import NONE, lower_places, upper_places
 from cairn_map.kernels.integer_kernels import signed
 
 ABSENT, INNER, LEAF, SIBLING = 0, 1, 2, 3
@@ -39,7 +38,6 @@ def code_masks(
     live = resumed(coder)
     odds = np.full(GROUPS * 2 * (FACES + EDGES + FAMILY), EVEN, np.uint32)
     weights = start_weights(2 * GROUPS, 3)
-    contexts = np.empty(3, np.int64)
     states = np.zeros((8 ** (stop + 1) - 1) // 7, np.uint8)
     states[0] = INNER
     keys = np.zeros(child_masks.shape[0] + 1, np.uint32)
@@ -48,6 +46,7 @@ def code_masks(
     for d in range(stop):
         is_last = d == depth - 1
         group = min(depth - 1 - d, GROUPS - 1)
+        below = offset + (1 << (3 * d))
         found = last
         # Inner nodes [first, last) of this depth; those of the next one are appended from `found` on.
         for n in range(first, last):
@@ -62,7 +61,7 @@ def code_masks(
             # Two questions about each child: does it exist, and is it a leaf?
             for c in range(8):
                 child = 8 * key + c
-                _contexts_into(contexts, states, offset + 8**d, child, d + 1, upper, children, group)
+                contexts = _contexts(states, below, child, d + 1, upper, children, group)
                 there, live = code_mixed(live, data, odds, contexts, 0, weights, 2 * group, (child_mask >> c) & 1)
                 if not there:
                     continue
@@ -71,7 +70,7 @@ def code_masks(
                     leaf, live = code_mixed(live, data, odds, contexts, 1, weights, 2 * group + 1, (leaf_mask >> c) & 1)
                 children |= 1 << c
                 leaves |= leaf << c
-                states[offset + 8**d + child] = LEAF if leaf else INNER
+                states[U(below + child)] = LEAF if leaf else INNER
                 if not leaf:
                     if found >= keys.shape[0]:
                         return -1, -1
@@ -84,62 +83,58 @@ def code_masks(
                 leaf_masks[leaf_at] = leaves
                 leaf_at += 1
         first, last = last, found
-        offset += 8**d
+        offset = below
     suspend_into(coder, live)
     return at, leaf_at
 
 
-@nb.njit(nogil=True)
-def _contexts_into(
-    contexts: npt.NDArray[np.int64],
-    states: Bytes,
-    offset: int,
-    child: int,
-    depth: int,
-    upper: int,
-    before: int,
-    group: int,
-) -> None:
-    """Write the contexts of a child at its depth, whose states begin at `offset`; `before`: siblings that exist."""
+@nb.njit(nogil=True, forceinline=True)
+def _contexts(states: Bytes, offset: int, child: int, depth: int, upper: int, before: int, group: int) -> Opinions:
+    """Contexts of a child at its depth, whose states begin at `offset`; `before`: siblings that exist."""
     # States as digits: lower neighbours across faces and edges, upper ones of the parent.
     faces = edges = above = 0
-    for i in LOWER[:3]:
-        faces = 3 * faces + state_of(states, offset, beside(child, i, depth), depth)
-    for i in LOWER[3:]:
-        edges = 3 * edges + state_of(states, offset, beside(child, i, depth), depth)
+    lower = lower_places(child, depth)
+    for i in range(3):
+        faces = 3 * faces + state_of(states, offset, lower[i], depth)
+    for i in range(3, 7):
+        edges = 3 * edges + state_of(states, offset, lower[i], depth)
     near = faces
     for axis in range(3):
         state = (upper >> (2 * axis)) & 3
         near = 4 * near + (state if (child >> axis) & 1 else SIBLING)
         above = 3 * above + state
     # The three opinions, each in a table of its own, two contexts each: one for each question.
-    contexts[0] = 2 * (near * GROUPS + group)
-    contexts[1] = 2 * (GROUPS * FACES + (edges * 27 + faces) * GROUPS + group)
     family = (above * 256 + before) * 8 + (child & 7)
-    contexts[2] = 2 * (GROUPS * (FACES + EDGES) + family * GROUPS + group)
+    return (
+        2 * (near * GROUPS + group),
+        2 * (GROUPS * FACES + (edges * 27 + faces) * GROUPS + group),
+        2 * (GROUPS * (FACES + EDGES) + family * GROUPS + group),
+    )
 
 
-@nb.njit(nogil=True)
+@nb.njit(nogil=True, forceinline=True)
 def upper_states(states: Bytes, offset: int, key: int, depth: int) -> int:
     """States of the three neighbours one step up, two bits each."""
-    found = 0
-    for axis in range(3):
-        found |= state_of(states, offset, stepped(key, axis, 1, depth), depth) << (2 * axis)
-    return found
+    x, y, z = upper_places(key, depth)
+    found = state_of(states, offset, x, depth)
+    found |= state_of(states, offset, y, depth) << 2
+    return found | (state_of(states, offset, z, depth) << 4)
 
 
-@nb.njit(nogil=True)
+@nb.njit(nogil=True, forceinline=True)
 def state_of(states: Bytes, offset: int, key: int, depth: int) -> int:
     """State of a node, whose depth's states begin at `offset`; LEAF in a larger leaf, ABSENT beyond the cell."""
-    if key == NONE:
-        return ABSENT
-    # A node inside a leaf has no state of its own: its ancestors are asked, up to the first that exists.
-    state = signed(states[offset + key])
-    while state == ABSENT and depth > 0:
-        depth -= 1
-        offset -= 8**depth
-        key >>= 3
-        state = signed(states[offset + key])
-        if state != ABSENT:
-            return LEAF if state == LEAF else ABSENT
+    state = ABSENT
+    if key != NONE:
+        state = signed(states[U(offset + key)])
+        if state == ABSENT:
+            # A node inside a leaf has no state of its own: its ancestors are asked, up to the first that exists.
+            while state == ABSENT and depth > 0:
+                depth -= 1
+                offset -= 1 << (3 * depth)
+                key >>= 3
+                state = signed(states[U(offset + key)])
+            state = LEAF if state == LEAF else ABSENT
+    # As in `mixing_kernels.code_number`: no references are counted.
+    _ = states.shape
     return state

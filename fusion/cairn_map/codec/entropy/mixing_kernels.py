@@ -7,14 +7,18 @@ As in Mahoney's PAQ, with one layer. A number takes a few such bits: zero or not
 section 14, "Mixing" and "Number", is the norm.
 """
 
+from typing import Any
+
 import numba as nb
 import numpy as np
 import numpy.typing as npt
 
 from cairn_map.arrays import Ints
-from cairn_map.codec.entropy.arithmetic_kernels import Data, Live, Odds, code_bit, learn, split
+from cairn_map.codec.entropy.arithmetic_kernels import Data, Live, Odds, code_bit, learnt, split
 from cairn_map.kernels.integer_kernels import signed
 
+U = np.uint64
+"""Type of the index in hot loops: a signed one is tested for being negative, which takes time."""
 KNOTS = np.array(
     [
         *(1, 2, 3, 6, 10, 16, 27, 45, 73, 120, 194, 310, 488, 747, 1101, 1546, 2047),
@@ -43,10 +47,12 @@ def _squash_table() -> npt.NDArray[np.int64]:
     return table
 
 
-SQUASH = _squash_table()
-"""Probability in 1/4096 by stretch + 2048."""
-STRETCH = np.minimum(np.searchsorted(SQUASH[1:], np.arange(4096)) - STRETCH_MAX, STRETCH_MAX)
+SQUASH = _squash_table().astype(np.int16)
+"""Probability in 1/4096 by stretch + 2048. Of 16 bits, like the next one: both stay in a processor's first cache."""
+STRETCH = np.minimum(np.searchsorted(SQUASH[1:], np.arange(4096)) - STRETCH_MAX, STRETCH_MAX).astype(np.int16)
 """By probability in 1/4096: the least stretch that gives at least so much."""
+Opinions = tuple[Any, ...]
+"""First contexts of three or four opinions, integers, each in a table of its own."""
 
 
 @nb.njit(nogil=True, forceinline=True)
@@ -57,28 +63,46 @@ def start_weights(rows: int, opinions: int) -> Ints:
 
 @nb.njit(nogil=True, forceinline=True)
 def code_mixed(
-    live: Live, data: Data, odds: Odds, contexts: Ints, slot: int, weights: Ints, row: int, bit: int
+    live: Live, data: Data, odds: Odds, contexts: Opinions, slot: int, weights: Ints, row: int, bit: int
 ) -> tuple[int, Live]:
-    """Code one bit under contexts[i] + slot of every opinion i, mixed by a row of weights; all of them learn."""
-    # The mixed probability: chance = squash(sum of weight * stretch(p)).
-    opinions = contexts.shape[0]
-    total = 0
-    for i in range(opinions):
-        total += STRETCH[signed(odds[signed(contexts[i]) + slot]) >> 20] * weights[row, i]
-    chance = SQUASH[min(max(total >> 16, -STRETCH_MAX), STRETCH_MAX) + STRETCH_MAX + 1]
+    """Code one bit under context + slot of every opinion, mixed by a row of weights; all of them learn."""
+    # The mixed probability: chance = squash(sum of weight * stretch(p)). What it is made of stays in registers: no
+    # table of one opinion overlaps another's.
+    at0, at1, at2, w = U(contexts[0] + slot), U(contexts[1] + slot), U(contexts[2] + slot), U(row)
+    odd0, odd1, odd2 = signed(odds[at0]), signed(odds[at1]), signed(odds[at2])
+    loud0, loud1, loud2 = weights[w, U(0)], weights[w, U(1)], weights[w, U(2)]
+    s0, s1, s2 = stretched(odd0), stretched(odd1), stretched(odd2)
+    total = s0 * loud0 + s1 * loud1 + s2 * loud2
+    # A fourth opinion, if there is one: the number of a tuple's members is known when this is compiled.
+    at3, odd3, loud3, s3 = at2, odd2, loud2, s2
+    if len(contexts) > 3:
+        at3 = U(contexts[-1] + slot)
+        odd3, loud3 = signed(odds[at3]), weights[w, U(3)]
+        s3 = stretched(odd3)
+        total += s3 * loud3
+    chance = signed(SQUASH[U(min(max(total >> 16, -STRETCH_MAX), STRETCH_MAX) + STRETCH_MAX + 1)])
     bit, live = split(live, data, chance, 12, bit)
     # Weights move along the gradient of the coding cost, stretch(p) * (bit - chance); then the contexts learn.
     error = ((bit << 12) - chance) * LEARNING
-    for i in range(opinions):
-        context = signed(contexts[i]) + slot
-        weights[row, i] += (STRETCH[signed(odds[context]) >> 20] * error + ONE // 2) >> 16
-        learn(odds, context, bit)
+    weights[w, U(0)] = loud0 + ((s0 * error + ONE // 2) >> 16)
+    weights[w, U(1)] = loud1 + ((s1 * error + ONE // 2) >> 16)
+    weights[w, U(2)] = loud2 + ((s2 * error + ONE // 2) >> 16)
+    odds[at0], odds[at1], odds[at2] = learnt(odd0, bit), learnt(odd1, bit), learnt(odd2, bit)
+    if len(contexts) > 3:
+        weights[w, U(3)] = loud3 + ((s3 * error + ONE // 2) >> 16)
+        odds[at3] = learnt(odd3, bit)
     return bit, live
 
 
-@nb.njit(nogil=True)
+@nb.njit(nogil=True, forceinline=True)
+def stretched(odd: int) -> int:
+    """Stretch of a context's probability."""
+    return signed(STRETCH[U(odd >> 20)])
+
+
+@nb.njit(nogil=True, forceinline=True)
 def code_number(
-    live: Live, data: Data, odds: Odds, contexts: Ints, weights: Ints, row: int, tails: Odds, tail: int, number: int
+    live: Live, data: Data, odds: Odds, contexts: Opinions, weights: Ints, row: int, tails: Odds, tail: int, number: int
 ) -> tuple[int, Live]:
     """Code a signed number, magnitude at most 2^63 - 1; small ones are short.
 
@@ -87,23 +111,32 @@ def code_number(
     """
     # Zero or not, and the sign.
     zero, live = code_mixed(live, data, odds, contexts, 0, weights, row, 1 if number == 0 else 0)
-    if zero:
-        return 0, live
-    negative, live = code_mixed(live, data, odds, contexts, 1, weights, row + 1, 1 if number < 0 else 0)
+    found = negative = 0
+    if not zero:
+        negative, live = code_mixed(live, data, odds, contexts, 1, weights, row + 1, 1 if number < 0 else 0)
+        found, live = _code_magnitude(live, data, odds, contexts, weights, row, tails, tail, abs(number))
+    # One way out, at which every array is named: else the compiler counts references to them here, for each number.
+    _ = data.shape, odds.shape, weights.shape, tails.shape
+    return (-found if negative else found), live
+
+
+@nb.njit(nogil=True, forceinline=True)
+def _code_magnitude(
+    live: Live, data: Data, odds: Odds, contexts: Opinions, weights: Ints, row: int, tails: Odds, tail: int, number: int
+) -> tuple[int, Live]:
+    """Code a number that is at least 1."""
     # The number of bits below the first, in unary.
-    magnitude = abs(number)
-    length = 0
-    while length < 62:
+    length, longer = 0, 1
+    while longer and length < 62:
         slot = 2 + min(length, LENGTH_SLOTS - 1)
-        longer = 1 if magnitude >> (length + 1) else 0
-        longer, live = code_mixed(live, data, odds, contexts, slot, weights, row + slot, longer)
-        if not longer:
-            break
-        length += 1
+        longer, live = code_mixed(
+            live, data, odds, contexts, slot, weights, row + slot, 1 if number >> (length + 1) else 0
+        )
+        length += longer
     # These bits, upper ones first; the first three know those before them.
     found = 1
     for n in range(length):
         context = tail + 8 * length + (found if n < 3 else 0)
-        bit, live = code_bit(live, data, tails, context, (magnitude >> (length - 1 - n)) & 1)
+        bit, live = code_bit(live, data, tails, context, (number >> (length - 1 - n)) & 1)
         found = 2 * found + bit
-    return (-found if negative else found), live
+    return found, live

@@ -23,8 +23,8 @@ STEPS = np.array(
     np.int64,
 )
 """Steps to neighbours that may come before: faces, lower edges, mixed edges, the corner."""
-LOWER = np.array([0, 1, 2, 3, 4, 5, 12], np.int64)
-"""Indices of the `STEPS` to neighbours that always come before, if they exist."""
+U = np.uint64
+"""Type of the index in hot loops: a signed one is tested for being negative, which takes time."""
 
 
 @nb.njit(cache=True, nogil=True)
@@ -49,36 +49,53 @@ def index_leaves(starts: Words32, sizes: Ints, depth: int) -> tuple[Int32s, Int3
     return brick_of, leaf_of
 
 
-@nb.njit(nogil=True)
+@nb.njit(nogil=True, forceinline=True)
 def leaf_at(brick_of: Int32s, leaf_of: Int32s, place: int) -> int:
     """Leaf that holds a place, or NONE."""
-    if place < 0:
-        return NONE
-    table = signed(brick_of[place >> 9])
-    if table >= 0:
-        return signed(leaf_of[table, place & 511])
-    return -2 - table if table <= -2 else NONE
+    found = NONE
+    if place >= 0:
+        table = signed(brick_of[U(place >> 9)])
+        if table >= 0:
+            found = signed(leaf_of[U(table), U(place & 511)])
+        elif table <= -2:
+            found = -2 - table
+    # As in `mixing_kernels.code_number`: no references are counted.
+    _ = brick_of.shape, leaf_of.shape
+    return found
 
 
-@nb.njit(nogil=True)
-def stepped(place: int, axis: int, step: int, depth: int) -> int:
-    """Place one step along an axis, -1, 0 or 1; NONE outside the cell or from NONE."""
-    if step == 0 or place < 0:
-        return place
+@nb.njit(nogil=True, forceinline=True)
+def along(place: int, axis: int, depth: int) -> tuple[int, int, int]:
+    """Bits that say where a place is along an axis: of the place one step below, its own, and of that one step above.
+
+    NONE beyond the cell. Three axes' bits joined by `|` are a place, or NONE if one of them is, for NONE has all bits.
+    """
     # Arithmetic on every third bit of a Morton code: the bits between are filled with ones, which pass a carry on.
     mask = (AXIS << axis) & ((1 << (3 * depth)) - 1)
-    own, rest = place & mask, place & ~mask
-    if step < 0:
-        return NONE if own == 0 else ((own - 1) & mask) | rest
-    return NONE if own == mask else (((own | ~mask) + 1) & mask) | rest
+    own = place & mask
+    return (NONE if own == 0 else (own - 1) & mask, own, NONE if own == mask else ((own | ~mask) + 1) & mask)
 
 
-@nb.njit(nogil=True)
-def beside(place: int, step: int, depth: int) -> int:
-    """Place next to another, by an index of `STEPS`, or NONE."""
-    for axis in range(3):
-        place = stepped(place, axis, STEPS[step, axis], depth)
-    return place
+@nb.njit(nogil=True, forceinline=True)
+def lower_places(place: int, depth: int) -> tuple[int, int, int, int, int, int, int]:
+    """Places of the seven neighbours that come before, or NONE: across three faces, three edges and the corner."""
+    (x0, x1, _), (y0, y1, _), (z0, z1, _) = along(place, 0, depth), along(place, 1, depth), along(place, 2, depth)
+    return (
+        x0 | y1 | z1,
+        x1 | y0 | z1,
+        x1 | y1 | z0,
+        x0 | y0 | z1,
+        x0 | y1 | z0,
+        x1 | y0 | z0,
+        x0 | y0 | z0,
+    )
+
+
+@nb.njit(nogil=True, forceinline=True)
+def upper_places(place: int, depth: int) -> tuple[int, int, int]:
+    """Places of the three neighbours one step up along each axis, or NONE."""
+    (_, x1, x2), (_, y1, y2), (_, z1, z2) = along(place, 0, depth), along(place, 1, depth), along(place, 2, depth)
+    return x2 | y1 | z1, x1 | y2 | z1, x1 | y1 | z2
 
 
 @nb.njit(cache=True, nogil=True)
@@ -89,12 +106,21 @@ def earlier_rows(starts: Words32, leaves: Ints, brick_of: Int32s, leaf_of: Int32
     """
     rows = np.full((leaves.shape[0], STEPS.shape[0]), NONE, np.int32)
     row_of = np.full(starts.shape[0], NONE, np.int32)
-    for s in range(leaves.shape[0]):
-        place = signed(starts[signed(leaves[s])])
-        for i in range(STEPS.shape[0]):
-            leaf = leaf_at(brick_of, leaf_of, beside(place, i, depth))
-            # A leaf that comes later has no row yet.
-            if leaf != NONE:
-                rows[s, i] = row_of[leaf]
-        row_of[leaves[s]] = s
+    for s in range(U(leaves.shape[0])):
+        own = U(leaves[s])
+        place = signed(starts[own])
+        (x0, x, x2), (y0, y, y2), (z0, z, z2) = along(place, 0, depth), along(place, 1, depth), along(place, 2, depth)
+        # In the order of `STEPS`.
+        faces = x0 | y | z, x | y0 | z, x | y | z0
+        lower_edges = x0 | y0 | z, x0 | y | z0, x | y0 | z0
+        mixed = x2 | y0 | z, x2 | y | z0, x0 | y2 | z, x | y2 | z0, x0 | y | z2, x | y0 | z2
+        column = U(0)
+        for near in (*faces, *lower_edges, *mixed, x0 | y0 | z0):
+            # A leaf that comes later has no row yet; its places are higher.
+            if near != NONE and near < place:
+                leaf = leaf_at(brick_of, leaf_of, near)
+                if leaf != NONE:
+                    rows[s, column] = row_of[U(leaf)]
+            column += U(1)
+        row_of[own] = s
     return rows
