@@ -7,6 +7,8 @@ As in Mahoney's PAQ, with one layer. A number takes a few such bits: zero or not
 section 14, "Mixing" and "Number", is the norm.
 """
 
+from typing import Any
+
 import numba as nb
 import numpy as np
 import numpy.typing as npt
@@ -49,8 +51,8 @@ SQUASH = _squash_table().astype(np.int16)
 """Probability in 1/4096 by stretch + 2048. Of 16 bits, like the next one: both stay in a processor's first cache."""
 STRETCH = np.minimum(np.searchsorted(SQUASH[1:], np.arange(4096)) - STRETCH_MAX, STRETCH_MAX).astype(np.int16)
 """By probability in 1/4096: the least stretch that gives at least so much."""
-Opinions = tuple[int, ...]
-"""First contexts of three or four opinions, each in a table of its own."""
+Opinions = tuple[Any, ...]
+"""First contexts of three or four opinions, integers, each in a table of its own."""
 
 
 @nb.njit(nogil=True, forceinline=True)

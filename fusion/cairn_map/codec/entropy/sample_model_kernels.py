@@ -238,7 +238,7 @@ def code_ranks(coder: Coder, data: Data, ranks: Ints, near: Int32s) -> bool:
             (TABLE + faces) * SLOTS,
             (2 * TABLE + firsts * 14 + count) * SLOTS,
         )
-        ranks[s], live = code_number(live, data, odds, contexts, loud, 0, tails, 0, ranks[s])
+        ranks[s], live = code_number(live, data, odds, contexts, loud, 0, tails, 0, ranks[s])  # pyright: ignore[reportArgumentType]
         if ranks[s] < 0 or ranks[s] > RANK_MAX:
             return False
     suspend_into(coder, live)
