@@ -236,7 +236,7 @@ def rim_refusal(dark: Image, found: GridFit) -> tuple[str, str] | None:
     outside = (outer[:, None] + diagonals).reshape(-1, 2)
     values = [
         _counts_at(dark, local_map(known, pixels, places, step=step)[0])
-        for places in (known, ground, half_way, outer, outside)
+        for places in (known, ground, half_way, near[~is_disc], outer, outside)
     ]
     if any(np.isnan(each).all() for each in values[:4]):
         return None
@@ -244,9 +244,9 @@ def rim_refusal(dark: Image, found: GridFit) -> tuple[str, str] | None:
     if disc == between:
         return None
     # 0 as the ground, 1 as a disc; NaN beyond the image, of which each comparison is false.
-    corner, beyond, around = ((each - between) / (disc - between) for each in values[2:])
+    corner, rim, beyond, around = ((each - between) / (disc - between) for each in values[2:])
     is_corner = abs(float(np.nanmedian(corner)) - 0.5) <= HALF_WAY
-    if is_corner and (beyond[~np.isnan(beyond)] > 0.5).mean() >= SQUARES_SHARE:
+    if is_corner and (rim[~np.isnan(rim)] > 0.5).mean() >= SQUARES_SHARE:
         return "rims", "what lies beyond the board's rim is like its discs: of a chessboard leave out --pattern"
     whole = np.column_stack([beyond, around.reshape(-1, len(sides))])
     whole = whole[~np.isnan(whole).any(axis=1)]
