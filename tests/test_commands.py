@@ -5,12 +5,14 @@ import os
 import re
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import chdir
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
+import httpx
 import numpy as np
 import pytest
 from tests.console.browsing import VIEW, browser, skip_without_page, tab
@@ -44,6 +46,10 @@ def typed(*arguments: object, folder: Path, code: int = 0) -> str:
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """One for all tests, each of which has maps of its own."""
     with served("--data", tmp_path_factory.mktemp("server")) as url:
+        # Its kernels are there: commands take it without, but `cairn doctor` says so.
+        end_s = time.monotonic() + COMMAND_S
+        while httpx.get(f"{url}/readyz").status_code != 200 and time.monotonic() < end_s:
+            time.sleep(0.2)
         yield url
 
 
