@@ -252,6 +252,7 @@ def test_a_reload_keeps_what_is_measured_and_chosen_and_back_undoes_the_flight(d
     page = desk.page
     page.keyboard.press("Escape")
     desk.tell("c.camera.home()")
+    desk.tell("c.findings.choose(null)")
     desk.tell("a[0].forEach((p) => c.measure.add(c.stage.controls.target.clone().set(...p)))", CORNERS)
     desk.settled()
     before = desk.tell("c.stage.view")
