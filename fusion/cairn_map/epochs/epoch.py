@@ -37,7 +37,11 @@ def epoch_of(time_s: float, epoch_s: int) -> Epoch:
     Raises:
         BadInputError: kind `bad_epoch`: not finite, or beyond `EPOCH_MAX` epochs.
     """
-    epoch = math.floor(time_s / epoch_s) if math.isfinite(time_s) else EPOCH_MAX + 1
+    epoch = EPOCH_MAX + 1
+    if math.isfinite(time_s):
+        # The quotient may be rounded up to the next epoch: of a time just before it, or of one as near to 0 as can be.
+        epoch = math.floor(time_s / epoch_s)
+        epoch -= epoch * epoch_s > time_s
     if abs(epoch) > EPOCH_MAX:
         raise BadInputError(
             "bad_epoch", f"a time must be within {EPOCH_MAX} epochs of {epoch_s} s of 1970, got {time_s}"

@@ -3,13 +3,15 @@
 import math
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from cairn_map.epochs.epoch import BASE, EPOCH_MAX, EPOCH_S_MAX, Epoch, begin_s, check_epoch, epoch_of
 from cairn_map.errors import BadInputError
 
 
+@example(-5e-324, 60)
+@example(math.nextafter(7.0 * 86400, 0), 7)
 @given(st.floats(-4e9, 4e9), st.integers(1, EPOCH_S_MAX))
 def test_a_time_lies_in_its_epoch(time_s: float, epoch_s: int) -> None:
     epoch = epoch_of(time_s, epoch_s)

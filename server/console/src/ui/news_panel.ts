@@ -7,11 +7,12 @@ import { clockTime } from "../units.ts";
 export class NewsPanel {
   readonly element: HTMLElement;
   onGo: (item: NewsItem) => void = () => {};
-  private readonly list = h("ol", { class: "lines", role: "log", "aria-label": "What changed" });
+  private readonly list = h("ol", { class: "lines" });
   private shown: readonly NewsItem[] = [];
 
   constructor() {
-    this.element = h("section", { class: "news", "aria-label": "News", hidden: true }, h("h2", {}, "News"), this.list);
+    const log = h("div", { role: "log", "aria-label": "What changed" }, this.list);
+    this.element = h("section", { class: "news", "aria-label": "News", hidden: true }, h("h2", {}, "News"), log);
   }
 
   show(items: readonly NewsItem[]): void {
