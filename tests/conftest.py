@@ -4,9 +4,9 @@ import os
 import signal
 import ssl
 from collections.abc import Iterator
+from importlib import import_module
 from typing import Any
 
-import httpx
 import pytest
 from hypothesis import HealthCheck, settings
 
@@ -87,13 +87,14 @@ def authorities_are_read_once() -> Iterator[None]:
 
     Tests make thousands of clients, and most speak to http:// alone.
     """
-    transports = httpx._transports.default  # type: ignore[attr-defined]
+    transports: Any = import_module("httpx._transports.default")
     make = transports.create_ssl_context
     kept: dict[object, ssl.SSLContext] = {}
 
     def context(verify: Any = True, cert: Any = None, trust_env: bool = True) -> ssl.SSLContext:
         if verify is not True or cert is not None:
-            return make(verify=verify, cert=cert, trust_env=trust_env)  # type: ignore[no-any-return]
+            own: ssl.SSLContext = make(verify=verify, cert=cert, trust_env=trust_env)
+            return own
         named = (trust_env, os.environ.get("SSL_CERT_FILE"), os.environ.get("SSL_CERT_DIR"))
         if named not in kept:
             kept[named] = make(verify=verify, cert=cert, trust_env=trust_env)

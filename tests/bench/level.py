@@ -5,6 +5,7 @@ $ python -m tests.bench level
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from tests.bench.timing import cpu_s
@@ -57,10 +58,7 @@ def _sweep_rows(smoke: bool) -> Iterator[Row]:
     limits, repeats = Integrator(max_range_m=80.0), 1 if smoke else 7
     for name, scan in sweeps.items():
         seconds = [
-            cpu_s(
-                lambda scan=scan, geometry=geometry: integrate_scans([scan], rig, geometry, integrator=limits),  # type: ignore[misc]
-                repeats,
-            )
+            cpu_s(partial(integrate_scans, [scan], rig, geometry, integrator=limits), repeats)
             for geometry in (geometry_for(voxel_edge_m=EDGE_M, channels=()), level_geometry())
         ]
         yield (

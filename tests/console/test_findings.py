@@ -29,7 +29,7 @@ ROLES = ("operator", "reader")
 LANDED = "c.findings.flight === null && !c.stage.isFlying && c.cells.waiting === 0"
 CELSIUS = "Math.max(...c.findings.all.map(({ celsius }) => celsius))"
 CORNERS = [[0.2, 0.2, 0.0], [1.4, 0.2, 0.0], [1.4, 1.4, 0.0]]
-"""Of a triangle on the floor, m."""
+"""Corners of a triangle on the floor, m."""
 MIDDLE = """(() => {
   const { clientWidth, clientHeight } = c.stage.canvas;
   return c.picker.at(clientWidth / 2, clientHeight / 2)?.centre.toArray() ?? null;

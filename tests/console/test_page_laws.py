@@ -31,7 +31,8 @@ VP8X = b"RIFF\x00\x00\x00\x00WEBPVP8X\x0a\x00\x00\x00\x00\x00\x00\x00" + bytes([
 
 @pytest.fixture(scope="module")
 def said(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """What the program says of laws, and of pictures by name: whole, cut within their heads, and none."""
+    """Answers of the program: the laws that do not hold, and the sizes of pictures: whole ones, ones cut within their
+    heads, and files that are none."""
     folder = tmp_path_factory.mktemp("pictures")
     image = np.random.default_rng(1).integers(0, 255, (HIGH, WIDE, 3), np.uint8)
     files = {name: cv2.imencode(suffix, image, options)[1].tobytes() for name, (suffix, options) in FORMS.items()}

@@ -66,7 +66,7 @@ class SimServer:
     """A server that can be restored and replaced."""
 
     def __init__(self, layer: MapLayer = PLAIN, *, name: str = MAP) -> None:
-        """Of a map, or of a layer of one by its name MAP.LAYER."""
+        """Make a server of a map, or of a layer of one, which is named MAP.LAYER."""
         self.layer = layer
         self.name = name
         self.settings = Settings()

@@ -41,7 +41,7 @@ def one_by_one(handle: PointHandle, points: Points) -> list[int]:
 
 
 def at_once(handle: PointHandle, points: Points, *, number: int | None = None) -> tuple[int, list[int]]:
-    """What `cairn_states` returns and writes."""
+    """Call `cairn_states`: its return value, and the states that it wrote, 77 where it wrote none."""
     function = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_uint64, ctypes.c_void_p, ctypes.c_int64, ctypes.c_void_p)(
         handle.states_address
     )

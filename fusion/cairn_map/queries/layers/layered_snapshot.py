@@ -168,7 +168,10 @@ class LayeredSnapshot:
             case "log_odds":
                 ask = self.log_odds_at
             case _:
-                ask = lambda points: self.reading_at(points, what).mean  # noqa: E731 - as short as its neighbours
+
+                def ask(points: Floats) -> npt.NDArray[Any]:
+                    return self.reading_at(points, what).mean
+
         x, y, edge_m = self._pixels(box_m)
         rows = max(1, point_queries.CHUNK // max(len(x), 1))
         parts = []

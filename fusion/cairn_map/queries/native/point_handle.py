@@ -125,8 +125,8 @@ class PointHandle:
     @property
     def state(self) -> Callable[[int, float, float, float], int]:
         """`cairn_state` as an object of ctypes, which functions compiled by Numba call, too."""
-        function: Any = kernels.state_function().ctypes
-        return function  # type: ignore[no-any-return]
+        function: Callable[[int, float, float, float], int] = kernels.state_function().ctypes
+        return function
 
     def close(self) -> None:
         """Close the handle, and wait for calls in progress; a second time does nothing."""
