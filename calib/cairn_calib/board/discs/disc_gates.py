@@ -2,7 +2,7 @@
 
 A fit is one of the board's discs if it is alike the others in contrast and crispness, round and of one size on the
 board as the places of its neighbours show it, and where those around it predict it. A grid is the board if few discs
-in view are missing and the lattice does not go on beyond its rim.
+in view are missing, the lattice does not go on beyond its rim, and nothing like its discs lies between them.
 """
 
 from collections.abc import Sequence
@@ -52,8 +52,8 @@ GROUND_SAMPLES, NEAR_RADII, NEAR_STEPS = 7, 1.1, 0.08
 DARK_LEAST, DARK_MOST, DARK_DISCS = 0.06, 0.2, 0.5
 """Share of the ground between four discs that may be as dark as they are: that of half a disc, within bounds."""
 ALIKE, ALONE = 0.3, 0.35
-"""Largest difference from a board's discs of what counts as one more beyond its rim, and the least from the ground
-between four on each side, contrasts."""
+"""Largest difference in brightness between a board's discs and one more beyond its rim, and the least between that one
+and the ground on its four diagonals, contrasts."""
 OUTER_SHARE = 0.25
 """Share of the places next to a board's rim, wholly in view, that may have one; clutter is at some."""
 DISC_PITCHES = (0.25, 1.0)
@@ -232,11 +232,11 @@ def rim_refusal(dark: Image, found: GridFit) -> tuple[str, str] | None:
     diagonals = (sides + np.roll(sides, 1, axis=0)) / 2
     ground = (known[:, None] + diagonals).reshape(-1, 2)
     half_way = np.repeat(known, len(sides), axis=0)[is_disc] + np.tile(sides, (len(known), 1))[is_disc] / 2
-    outer = np.unique(near[~is_disc], axis=0)
+    outer, outer_of = np.unique(near[~is_disc], axis=0, return_inverse=True)
     outside = (outer[:, None] + diagonals).reshape(-1, 2)
     values = [
         _counts_at(dark, local_map(known, pixels, places, step=step)[0])
-        for places in (known, ground, half_way, near[~is_disc], outer, outside)
+        for places in (known, ground, half_way, outer, outside)
     ]
     if any(np.isnan(each).all() for each in values[:4]):
         return None
@@ -244,8 +244,8 @@ def rim_refusal(dark: Image, found: GridFit) -> tuple[str, str] | None:
     if disc == between:
         return None
     # 0 as the ground, 1 as a disc; NaN beyond the image, of which each comparison is false.
-    corner, rim, beyond, around = ((each - between) / (disc - between) for each in values[2:])
-    is_corner = abs(float(np.nanmedian(corner)) - 0.5) <= HALF_WAY
+    corner, beyond, around = ((each - between) / (disc - between) for each in values[2:])
+    is_corner, rim = abs(float(np.nanmedian(corner)) - 0.5) <= HALF_WAY, beyond[outer_of.ravel()]
     if is_corner and (rim[~np.isnan(rim)] > 0.5).mean() >= SQUARES_SHARE:
         return "rims", "what lies beyond the board's rim is like its discs: of a chessboard leave out --pattern"
     whole = np.column_stack([beyond, around.reshape(-1, len(sides))])
@@ -257,7 +257,7 @@ def rim_refusal(dark: Image, found: GridFit) -> tuple[str, str] | None:
 def ground_refusal(dark: Image, found: GridFit) -> tuple[str, str] | None:
     """The gate that refuses a grid with other things like its discs between them, and why; None where it is a board.
 
-    So are every other hole of a perforated plate, and keys of a keyboard that lie a knight's move from each other.
+    A perforated plate of which every other hole is named is such a grid, or keys of a keyboard a knight's move apart.
     """
     step, lattice = neighbour_step(found.board), found.board.lattice()
     # Four discs around each piece of ground, by their places.
@@ -275,9 +275,9 @@ def ground_refusal(dark: Image, found: GridFit) -> tuple[str, str] | None:
     is_ground = near > NEAR_RADII * radius + NEAR_STEPS
     if not len(fours) or is_ground.sum() < GROUND_SAMPLES:
         return None
-    places = lattice[fours[:, 0], None] + a[is_ground, None] * across + b[is_ground, None] * down
-    pixels, _ = local_map(lattice[found.kept], found.pixels[found.kept], places.reshape(-1, 2), step=step)
-    counts = _counts_at(dark, pixels).reshape(len(fours), -1)
+    # Between the four it is bilinear enough, whatever the lens: nearest pixels are looked at.
+    shares = np.stack([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b], axis=1)[is_ground]
+    counts = _counts_at(dark, (shares @ found.pixels[fours]).reshape(-1, 2)).reshape(len(fours), -1)
     disc = _counts_at(dark, found.pixels[fours.ravel()]).reshape(fours.shape).mean(axis=1)
     # Of each four: light and heat may change over a board.
     usual = np.median([each.contrast for each, kept in zip(found.fits, found.kept, strict=True) if kept and each])

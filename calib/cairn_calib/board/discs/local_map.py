@@ -15,6 +15,8 @@ CURVATURE_SIGMA = 0.2
 """Prior standard deviation of the curvature, steps a step squared, against misses of `MISS_STEPS`."""
 MISS_STEPS = 0.02
 LEAST_WEIGHT = 1e-4
+PAIRS_MAX = 1 << 16
+"""Places times known points that are fitted at once: some 20 MB, whatever the board."""
 
 
 def local_map(lattice: Floats, pixels: Floats, places: Floats, *, step: float = 1.0) -> tuple[Floats, Floats]:
@@ -26,8 +28,14 @@ def local_map(lattice: Floats, pixels: Floats, places: Floats, *, step: float = 
         places: (M, 2) places of the lattice that are asked for.
         step: distance of neighbours on the lattice.
     """
-    away = (lattice[None] - places[:, None]) / step
-    return _fitted(away, pixels, np.ones(away.shape[:2]), step)
+    # Part by part: each place is fitted alone, to all known points.
+    at_once = max(1, PAIRS_MAX // max(len(lattice), 1))
+    found, steps = np.empty((len(places), 2)), np.empty((len(places), 2, 2))
+    for start in range(0, len(places), at_once):
+        part = slice(start, start + at_once)
+        away = (lattice[None] - places[part, None]) / step
+        found[part], steps[part] = _fitted(away, pixels, np.ones(away.shape[:2]), step)
+    return found, steps
 
 
 def predicted_by_others(lattice: Floats, pixels: Floats, *, step: float = 1.0) -> Floats:

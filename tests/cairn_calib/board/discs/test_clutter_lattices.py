@@ -1,5 +1,6 @@
 """Lattices that clutter makes are refused before any outline is fitted, which is what takes long."""
 
+import tracemalloc
 from typing import Any
 
 import cv2
@@ -9,7 +10,7 @@ import pytest
 from tests.fixtures.calib.board_images import DISCS, TOF, picture, pose
 
 from cairn_calib.board.board import Board
-from cairn_calib.board.discs import disc_outline
+from cairn_calib.board.discs import disc_outline, local_map
 from cairn_calib.board.discs.blobs import dark_blobs
 from cairn_calib.board.discs.disc_gates import ground_refusal, is_regular, rim_refusal, seen_min
 from cairn_calib.board.discs.disc_grid import find_circles
@@ -188,3 +189,17 @@ def test_a_fit_that_ends_early_is_a_refusal_and_one_that_does_not_is_the_same() 
     hidden = image.copy()
     hidden[:, : image.shape[1] // 2] = float(np.median(image))
     assert fit_grid(hidden, expected, least=least) is None
+
+
+def test_a_local_map_takes_the_memory_of_a_part_and_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(5)
+    known, places = rng.uniform(0, 20, (400, 2)), rng.uniform(0, 20, (2000, 2))
+    pixels = 10 * known + rng.normal(0, 0.1, known.shape)
+    tracemalloc.start()
+    parts = local_map.local_map(known, pixels, places)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 30e6
+    monkeypatch.setattr(local_map, "PAIRS_MAX", 1 << 30)
+    for part, whole in zip(parts, local_map.local_map(known, pixels, places), strict=True):
+        np.testing.assert_array_equal(part, whole)
