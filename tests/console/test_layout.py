@@ -17,14 +17,18 @@ PHONE_ASIDE: ViewportSize = {"width": 844, "height": 390}
 WIDE: ViewportSize = {"width": 1440, "height": 900}
 LEAST_SHARES = ((WIDE, 0.70), (VIEW, 0.70), (TABLET, 0.60), (PHONE, 0.85), (PHONE_ASIDE, 0.85))
 SHARE = """() => {
+  const lanes = document.createElement("div");
+  lanes.style.height = "540px";
+  document.querySelector(".axis").append(lanes);
   let [inside, all] = [0, 0];
   for (let x = 2; x < innerWidth; x += 6) for (let y = 2; y < innerHeight; y += 6) {
     all++;
     if (document.elementFromPoint(x, y)?.closest(".view")) inside++;
   }
+  lanes.remove();
   return inside / all;
 }"""
-"""Part of the screen that is map, with what is written in the picture."""
+"""Part of the screen that is map, with what is written in the picture, and an axis of time that has thirty lanes."""
 SMALL = """(least) => [...document.querySelectorAll("button, select, summary, input, a[href]")]
   .filter((e) => e.checkVisibility({visibilityProperty: true}) && !e.closest(".strip"))
   .map((e) => [e, (e.type === "checkbox" ? e.closest("label") : e).getBoundingClientRect()])

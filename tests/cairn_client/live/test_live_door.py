@@ -310,21 +310,20 @@ def test_labels_of_other_classes_than_the_layer_s_are_refused(
     # Without a link the folder of an earlier run knows them.
     grid = geometry_for(voxel_edge_m=VOXEL_M, channels=(classes,))
     Robot(None, NOWHERE, directory=tmp_path / "mole", name="mole", geometry=grid, stay=True).close()
-    bridge.stop()
-    bridge.start()
-    bridge.offer_all(timed)
-    sender = threading.Thread(target=send_when_subscribed, args=(bridge, timed))
-    sender.start()
     (tmp_path / "live.yaml").write_text(topics)
     where = ["--map", NOWHERE, "--name", "mole", "--state", str(tmp_path / "mole"), "--stay"]
-    assert cairn.main(["robot", "live", bridge.url, "--topics", str(tmp_path / "live.yaml"), *where]) == 2
-    sender.join()
+    with a_bridge() as second:
+        second.offer_all(timed)
+        sender = threading.Thread(target=send_when_subscribed, args=(second, timed))
+        sender.start()
+        assert cairn.main(["robot", "live", second.url, "--topics", str(tmp_path / "live.yaml"), *where]) == 2
+        sender.join()
     said = capsys.readouterr().err
     assert "[unknown_class]" in said and "the labels name chair, and the map's classes are wall, table, other" in said
 
 
 def send_when_subscribed(bridge: Bridge, timed: Sequence[Timed]) -> None:
-    bridge.wait_for(*TOPICS)
+    bridge.wait_for(*{topic for _, topic, _ in timed})
     for entry in timed:
         bridge.send(entry)
 

@@ -160,18 +160,7 @@ class LayeredSnapshot:
         Raises:
             BadInputError: as there; kind `too_large`: more than 67 million pixels: give a box, or ask one layer.
         """
-        match what:
-            case "state":
-                ask: Callable[[Floats], npt.NDArray[Any]] = self.state_at
-            case "probability":
-                ask = self.probability_at
-            case "log_odds":
-                ask = self.log_odds_at
-            case _:
-
-                def ask(points: Floats) -> npt.NDArray[Any]:
-                    return self.reading_at(points, what).mean
-
+        ask = self._points_of(what)
         x, y, edge_m = self._pixels(box_m)
         rows = max(1, point_queries.CHUNK // max(len(x), 1))
         parts = []
@@ -181,6 +170,17 @@ class LayeredSnapshot:
             values = ask(points)
             parts.append(values.reshape(*columns[0].shape, *values.shape[1:]))
         return MapImage(np.concatenate(parts), _origin(x, y), edge_m)
+
+    def _points_of(self, what: str) -> Callable[[Floats], npt.NDArray[Any]]:
+        """What `layer_at` asks for each point: a state, a probability, log odds, or the mean of a channel."""
+        match what:
+            case "state":
+                return self.state_at
+            case "probability":
+                return self.probability_at
+            case "log_odds":
+                return self.log_odds_at
+        return lambda points_m: self.reading_at(points_m, what).mean
 
     def height_map(self, *, box_m: Box | None = None) -> MapImage:
         """Height of the upper face of each column's highest voxel of `occupied_in`, metres; NaN where there is none.
