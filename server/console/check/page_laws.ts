@@ -7,6 +7,7 @@ import { fromHash, POINTS_MAX, toHash } from "../src/look.ts";
 import type { LiveEvent, LogEntry } from "../src/messages.ts";
 import { NewsBook } from "../src/news.ts";
 import { sizeOf } from "../src/picture_size.ts";
+import { SLACK, StandingPlan } from "../src/scene/detail.ts";
 import { HELD_MAX, Timeline } from "../src/timeline.ts";
 
 const wrong: string[] = [];
@@ -71,6 +72,23 @@ for (const count of [0, 1, 3, POINTS_MAX]) {
   law("an address has all points of a measure", JSON.stringify(fromHash(toHash("a", look, null)).look.points) === JSON.stringify(points(count)));
 }
 for (const text of ["1,2", "1,2,x", "1,2,NaN", "1,2,1e999", points(POINTS_MAX + 1).flat().join()]) law(`points=${text} are none`, fromHash(`#map=a&points=${text}`).look.points.length === 0);
+
+const standing = new StandingPlan();
+const room = 1000;
+const isKept = (view: string, drawn = 0) => !standing.isDue(view, drawn, room);
+law("without a plan depths are chosen", !isKept("a"));
+standing.note(true);
+law("at now depths follow what comes", !isKept("a"));
+standing.keep();
+law("depths that were chosen for now are kept at other moments while the eye rests", isKept("a", SLACK * room) && !isKept("b"));
+law("depths at which more is drawn than there is room for are not kept", isKept("a") && !isKept("a", SLACK * room + 1));
+standing.note(false);
+standing.keep();
+law("depths that were chosen for a past moment are kept at no other", !isKept("a"));
+standing.note(true);
+standing.keep();
+standing.release();
+law("depths are chosen again where cells changed", !isKept("a"));
 
 const news = new NewsBook();
 const hear = (event: object) => news.hear(event as LiveEvent);

@@ -104,8 +104,9 @@ export class Appearance {
     // A level's plan tells what hinders a vehicle, by whatever its picture is coloured.
     const isOfGround = this.look.field === "slope" || this.look.field === "step";
     const field = this.cells.isLevel && !isOfGround ? "difficulty" : this.look.field;
-    const range = this.look.ranges[field] ?? rangeOf(this.cells, field, -FAR_M, FAR_M) ?? [0, 1];
-    return { theme: document.documentElement.dataset.theme === "light" ? "light" : "dark", field, rangeK, range: this.cells.isLevel ? range : [0, 1] };
+    // A level's ranges are constants; another map's heights or temperatures would be sampled and sorted a few times a second.
+    const range: [number, number] = this.cells.isLevel ? (this.look.ranges[field] ?? rangeOf(this.cells, field, -FAR_M, FAR_M) ?? [0, 1]) : [0, 1];
+    return { theme: document.documentElement.dataset.theme === "light" ? "light" : "dark", field, rangeK, range };
   }
 
   /** Dark or light, as the page is. */

@@ -5,7 +5,7 @@ import { ApiError, NONE_READY, type Api, type CellAnswer, type ReadyViews } from
 import type { CellEntry, MapInfo, Triple } from "../messages.ts";
 import type { Moment } from "../timeline.ts";
 import { Decoders } from "./decoders.ts";
-import { COARSE, plan } from "./detail.ts";
+import { COARSE, plan, StandingPlan } from "./detail.ts";
 import { squares, uniforms } from "./materials.ts";
 import { PastViews } from "./past_views.ts";
 import { NEVER_MS, samplePoints, ShownCell } from "./shown_cell.ts";
@@ -48,9 +48,7 @@ export class Cells {
   private readonly api: Api;
   private readonly map: string;
   private planned = false;
-  /** View of the last plan, and that for which depths stay as they are at whatever moment; empty: none. */
-  private view = "";
-  private settledView = "";
+  private readonly standing = new StandingPlan();
   private ready = NONE_READY;
   /** Moment that is shown, or on its way; null: now. */
   private moment: Moment | null = null;
@@ -74,7 +72,7 @@ export class Cells {
   /** Take over the whole index: what differs from what is shown is taken from `ready` or fetched, what is gone goes. */
   takeIndex(entries: readonly CellEntry[], ready: ReadyViews): void {
     this.ready = ready;
-    this.settledView = "";
+    this.standing.release();
     const there = new Set<string>();
     // Entries of another log may have the same numbers.
     this.past.forget();
@@ -108,15 +106,14 @@ export class Cells {
     shown.digest = "";
     shown.dirty = true;
     this.head = Math.max(this.head, lm);
-    this.settledView = "";
+    this.standing.release();
     this.planned = false;
   }
 
   /** Show the map as it was at a moment; null: as it is. What was shown before is kept, so the way back is short. */
   showMoment(moment: Moment | null): void {
     if (moment?.key === this.moment?.key) return;
-    // One plan for all moments: of two, each moment would want some cells at depths that it was not seen at before.
-    if (this.planned && !this.waiting) this.settledView = this.view;
+    if (this.planned && !this.waiting) this.standing.keep();
     if (!this.moment) {
       for (const cell of this.all.values()) {
         // Of a busy cell that changed the old bytes are still shown: under the name of its new state they would come back as now.
@@ -204,14 +201,14 @@ export class Cells {
 
   /** Choose depths for where the eye is, and fetch what is missing. */
   update(camera: PerspectiveCamera, heightPx: number, frustum: { intersectsBox(box: Box3): boolean }): void {
-    this.view = JSON.stringify([camera.matrixWorld.elements, camera.projectionMatrix.elements, heightPx, this.budget]);
-    if (this.view !== this.settledView) this.choose(camera, heightPx, frustum);
+    const view = JSON.stringify([camera.matrixWorld.elements, camera.projectionMatrix.elements, heightPx, this.budget]);
+    if (this.standing.isDue(view, this.drawn, this.budget)) this.choose(camera, heightPx, frustum);
     this.planned = true;
     this.fetchMore();
   }
 
   private choose(camera: PerspectiveCamera, heightPx: number, frustum: { intersectsBox(box: Box3): boolean }): void {
-    this.settledView = "";
+    this.standing.note(this.moment === null);
     const cells = [...this.all.values()];
     const pxPerRad = heightPx / (2 * Math.tan((camera.fov * Math.PI) / 360));
     const candidates = cells.map((cell) => {
@@ -389,7 +386,7 @@ export class Cells {
   }
 
   private remove(cell: ShownCell): void {
-    this.settledView = "";
+    this.standing.release();
     cell.drop();
     if (this.all.delete(cell.key)) this.free.push(cell.number);
   }

@@ -40,6 +40,39 @@ export function expected(cell: Candidate, depth: number): number {
   return Math.min(60 * GROWTH ** (depth - 3), most);
 }
 
+/** Plan of depths that is kept at other moments: one that was made of the map as it is now, while the eye rests and what it draws has room.
+ *
+ * With a plan for each moment, some cells would be wanted at depths that they were not seen at before. A plan that was made of the
+ * past is not kept: a cell that was empty costs nothing at its voxels, and may be full at another moment. */
+export class StandingPlan {
+  /** View of the last plan, and the one for which depths stay as they are; empty: none. */
+  private view = "";
+  private keptView = "";
+  private isOfNow = false;
+
+  /** Take over the eye's view; true: depths are to be chosen, as it is another one or more is drawn than there is room for. */
+  isDue(view: string, drawn: number, budget: number): boolean {
+    this.view = view;
+    return view !== this.keptView || drawn > budget * SLACK;
+  }
+
+  /** Take note that depths were chosen; `isOfNow`: for the map as it is now. */
+  note(isOfNow: boolean): void {
+    this.keptView = "";
+    this.isOfNow = isOfNow;
+  }
+
+  /** Keep the depths at another moment, if they were chosen for now. */
+  keep(): void {
+    if (this.isOfNow) this.keptView = this.view;
+  }
+
+  /** Let depths be chosen again: cells changed. */
+  release(): void {
+    this.keptView = "";
+  }
+}
+
 /** A depth for each cell; 0: not shown, because not even its coarsest picture has room. */
 export function plan(cells: readonly Candidate[], budget: number): number[] {
   const nearest = cells.map((_, n) => n).sort((a, b) => cells[b].sizePx - cells[a].sizePx || cells[a].distanceM - cells[b].distanceM);
