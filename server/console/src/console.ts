@@ -436,7 +436,7 @@ export class Console {
     this.duties.tick();
     this.findings.tick();
     this.measure.tick();
-    this.news.look(this.findings.all, this.findings.spots.isWhole);
+    this.news.look(this.findings.all, this.findings.spots);
     this.newsPanel.show(this.news.items);
     this.dutyPanel.show(this.duties);
     this.plan.tick();

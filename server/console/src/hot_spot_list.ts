@@ -18,11 +18,12 @@ export class HotSpotList {
   spots: readonly HotSpot[] = [];
   /** Of which these are the first. */
   total = 0;
-  /** All of the map was looked through for what is above the threshold. */
-  isWhole = false;
+  /** `spots` are of a search through all of the map for what is above the threshold. */
+  isComplete = false;
   /** Why there is no list, or not all of it; empty: there is. */
   said = "";
-  private overC: number;
+  /** Threshold of the list that is asked for, °C. */
+  overC: number;
   /** When to ask, as of performance.now(). */
   private askAtMs = 0;
   private isAsking = false;
@@ -48,7 +49,7 @@ export class HotSpotList {
   setThreshold(overC: number): void {
     if (overC === this.overC) return;
     this.overC = overC;
-    this.isWhole = false;
+    this.isComplete = false;
     this.askAtMs = 0;
   }
 
@@ -70,7 +71,7 @@ export class HotSpotList {
       const found = await this.api.json<HotSpots>(`maps/${this.map}/main/hotspots?over_k=${overK}&count=${COUNT}`);
       this.spots = found.spots;
       this.total = found.total;
-      this.isWhole = found.complete && overC === this.overC;
+      this.isComplete = found.complete && overC === this.overC;
       this.said = found.complete ? "" : "The server is still looking through the map.";
       this.tries = found.complete ? 0 : this.tries + 1;
       if (!found.complete && this.tries < TRIES) this.askAtMs = this.nextMs;
@@ -88,6 +89,7 @@ export class HotSpotList {
     if (kind === "unknown_channel" || kind === "no_route" || kind === "too_costly") {
       this.spots = [];
       this.total = 0;
+      this.isComplete = false;
       this.said =
         kind === "unknown_channel" ? COLD
         : kind === "no_route" ? "This server is older than lists of hot spots."
