@@ -117,7 +117,7 @@ export class Cells {
     if (!this.moment) {
       for (const cell of this.all.values()) {
         // Of a busy cell that changed the old bytes are still shown: under the name of its new state they would come back as now.
-        if (!cell.dirty && !cell.busy && cell.etag !== null) this.past.put(...this.nameOf(cell, cell.depth), cell.bytes);
+        if (!cell.dirty && !cell.busy && cell.etag !== null) this.past.put(...this.nameOf(cell, cell.depth), cell.source);
       }
     }
     this.moment = moment;
@@ -132,7 +132,7 @@ export class Cells {
       if (!bytes) continue;
       cell.momentKey = this.momentKey;
       cell.etag = "";
-      if (bytes === cell.bytes) continue;
+      if (bytes === cell.source) continue;
       this.show(cell, bytes, depth);
       cell.counted(depth);
     }
@@ -378,7 +378,7 @@ export class Cells {
     const key = cell.join(",");
     let shown = this.all.get(key);
     if (!shown) {
-      shown = new ShownCell(cell, this.edgeM, this.heightM, this.free.pop() ?? this.byNumber.length);
+      shown = new ShownCell(cell, this, this.free.pop() ?? this.byNumber.length);
       this.byNumber[shown.number] = shown;
       this.all.set(key, shown);
     }
