@@ -38,6 +38,7 @@ GROUND_SHOWN = """[...c.cells.all.values()].flatMap((cell) => Array.from({ lengt
 """Column, height, difficulty, slope in degrees and step of each node."""
 COLOURED = 1
 """Flag of nodes into which their ground is written: decode/pack.ts."""
+IS_UNWRITTEN = f"(bytes) => bytes.every((byte, n) => n % 12 !== 7 || !(byte & {COLOURED}))"
 
 
 def things_commit(n: int) -> Commit:
@@ -149,10 +150,26 @@ def test_what_is_written_into_the_ground_is_of_the_moment_that_is_shown_alone(co
     kept, cells = console.tell("[[...c.cells.past.views.values()], c.cells.all.size]")
     assert len(kept) == 2 * cells, "of each cell two moments"
     assert console.tell("c.cells.past.shares.size") == cells
-    assert console.tell(
-        f"[...c.cells.past.views.values()].every((bytes) => bytes.every((byte, n) => n % 12 !== 7 || !(byte & {COLOURED})))"
-    )
+    assert console.tell(f"[...c.cells.past.views.values()].every({IS_UNWRITTEN})")
     assert console.tell(GROUND_SHOWN) == drawn
+
+
+def test_a_cell_that_is_unknown_at_a_moment_keeps_no_other_from_being_fetched_ahead(console: Console) -> None:
+    chosen(console, GROUND)
+    page = console.page
+    first, *others = console.tell("(c.cells.past.forget(), [...c.cells.all.keys()])")
+    ahead = "c.cells.lookAhead({ atS: 4e9, key: 'then' }).catch(({ kind }) => kind)"
+    refusal = {"kind": "not_known", "title": "unknown", "detail": "that time is not kept apart"}
+    views = f"**/cells/{first}.view?*"
+    page.route(views, lambda route: route.abort())
+    assert console.tell(ahead) == "unreachable"
+    assert console.tell("c.cells.past.views.size") == 0, "a server that does not answer is asked once"
+    page.unroute(views)
+    page.route(views, lambda route: route.fulfill(status=409, json=refusal, content_type="application/problem+json"))
+    assert console.tell(ahead) is None
+    page.unroute(views)
+    console.errors.clear()  # the browser reports both answers
+    assert [name.split("/")[0] for name in console.tell("[...c.cells.past.views.keys()]")] == others
 
 
 def test_a_plan_and_a_report_have_the_ground_that_was_found_after_the_cells_came(console: Console) -> None:
@@ -162,7 +179,9 @@ def test_a_plan_and_a_report_have_the_ground_that_was_found_after_the_cells_came
     report = "c.plan.pictures(120, 80).map(({ canvas }) => canvas.toDataURL())"
     whole = console.tell(report)
     unwritten = f"""(() => {{
-      for (const {{ bytes }} of c.cells.all.values()) for (let at = 7; at < bytes.length; at += 12) bytes[at] &= ~{COLOURED};
+      for (const {{ bytes }} of c.cells.all.values()) {{
+        for (let at = 7; at < bytes.length; at += 12) bytes[at] &= ~{COLOURED};
+      }}
       c.ground.madeOf = new WeakMap();
       c.ground.seen = -1;
     }})()"""

@@ -133,6 +133,15 @@ def test_a_moment_seen_before_asks_the_server_for_nothing(console: Console) -> N
     assert [url for url in console.requests if "/main/cells" in url] == []
 
 
+def test_after_a_step_any_other_move_ends_the_look_ahead(console: Console) -> None:
+    """What is fetched ahead is where one more step would lead."""
+    for move in ("c.time.showNow()", "c.time.show(a[0])", "c.time.follow()"):
+        assert console.tell("(c.time.step(-1), c.time.isLookingAhead)")
+        assert not console.tell(f"({move}, c.time.isLookingAhead)", START_S)
+    console.tell("c.time.showNow()")
+    console.settled()
+
+
 def test_one_plan_of_depths_counts_for_all_moments_while_the_eye_rests(console: Console) -> None:
     budget, whole = console.tell("[c.cells.budget, c.cells.drawn]")
     console.tell("(c.cells.budget = a[0], c.replan())", int(ROOM * whole))

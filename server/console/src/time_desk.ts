@@ -32,9 +32,10 @@ export class TimeDesk {
   private isReading = false;
   /** A handle that is dragged moves more often than frames are drawn. */
   private wanted: { handle: number; atS: number | null } | null = null;
-  /** Who steps goes on that way: what comes next is fetched before it is asked for. `undefined`: nothing is to be. */
+  /** Moment that one more step would show, which is fetched once all that is shown is there; undefined: none. */
   private ahead: { atS: number | null } | undefined;
-  isLookingAhead = false;
+  /** Moments that are fetched ahead at present. */
+  private fetchesAhead = 0;
   private readonly api: Api;
   private readonly info: MapInfo;
   private readonly look: Look;
@@ -68,6 +69,7 @@ export class TimeDesk {
   /** The map as it was at a time, by capture; null: now. */
   show(atS: number | null): void {
     const moment = atS === null ? null : this.timeline.momentAt(atS);
+    this.ahead = undefined;
     this.look.atS = moment?.atS ?? null;
     if (this.look.sinceS !== null && atS !== null) this.look.sinceS = Math.min(this.look.sinceS, atS);
     this.cells.showMoment(moment);
@@ -105,8 +107,12 @@ export class TimeDesk {
     const next = this.next(isFirst ? this.look.sinceS : this.look.atS, by);
     if (isFirst) return this.since(next);
     this.show(next);
-    this.isLookingAhead = Number.isFinite(by) && (next !== null || by < 0);
-    this.ahead = this.isLookingAhead ? { atS: this.next(next, by) } : undefined;
+    if (Number.isFinite(by) && (next !== null || by < 0)) this.ahead = { atS: this.next(next, by) };
+  }
+
+  /** A moment is fetched that is not shown yet, or is about to be. */
+  get isLookingAhead(): boolean {
+    return this.ahead !== undefined || this.fetchesAhead > 0;
   }
 
   /** Moment so many further on; null: now. */
@@ -138,12 +144,13 @@ export class TimeDesk {
 
   private async lookAhead(atS: number | null): Promise<void> {
     this.ahead = undefined;
+    this.fetchesAhead++;
     try {
       await this.cells.lookAhead(atS === null ? null : this.timeline.momentAt(atS));
     } catch {
-      // Whoever goes there hears why it is not known.
+      // The step that shows it asks again, and says why it is not there.
     } finally {
-      this.isLookingAhead = this.ahead !== undefined;
+      this.fetchesAhead--;
     }
   }
 

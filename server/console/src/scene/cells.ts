@@ -140,15 +140,21 @@ export class Cells {
     this.onChange(true);
   }
 
-  /** Fetch what another moment shows, cell by cell, until a third one is turned to; null: now. */
+  /** Fetch all cells as they are at a moment that is not shown yet, one by one, and keep them; null: now. Ends early when the moment that is shown changes.
+   *
+   * A cell that the server does not know at that moment is left out. Throws `ApiError` where the server cannot be asked for more. */
   async lookAhead(moment: Moment | null): Promise<void> {
     const { turns } = this;
     for (const cell of [...this.all.values()]) {
       const depth = cell.depth || cell.wanted;
       const name: [string, string] = [`${cell.key}/${depth}`, `${cell.lm}/${moment?.key ?? ""}`];
       if (!depth || this.past.has(...name)) continue;
-      const { data } = await this.api.view(this.map, cell.key, depth, { etag: null, atS: moment?.atS ?? null });
-      if (data) this.past.put(...name, await this.decoders.decode(data));
+      try {
+        const { data } = await this.api.view(this.map, cell.key, depth, { etag: null, atS: moment?.atS ?? null });
+        if (data) this.past.put(...name, await this.decoders.decode(data));
+      } catch (error) {
+        if (!isUnknownThen(error) && !isNoCell(error)) throw error;
+      }
       if (turns !== this.turns) return;
     }
   }
@@ -158,7 +164,7 @@ export class Cells {
     return this.moment?.key ?? "";
   }
 
-  /** Of what a cell is at a depth and at the moment that is shown. */
+  /** Name of a cell's nodes at a depth and at the moment that is shown. */
   private nameOf(cell: ShownCell, depth: number): [string, string] {
     return [`${cell.key}/${depth}`, `${cell.lm}/${this.momentKey}`];
   }
@@ -311,8 +317,8 @@ export class Cells {
     cell.failedMs = performance.now();
     window.setTimeout(() => this.onChange(false), RETRY_MS);
     if (error instanceof ApiError && error.wantsToken) this.onRefused();
-    else if (error instanceof ApiError && error.kind === "no_cell") this.remove(cell);
-    else if (this.moment && error instanceof ApiError && (error.kind === "not_known" || error.kind === "too_costly")) this.lacks(cell, error.message);
+    else if (isNoCell(error)) this.remove(cell);
+    else if (this.moment && isUnknownThen(error)) this.lacks(cell, error.message);
     else this.error = `cell ${cell.key}: ${error instanceof Error ? error.message : String(error)}`;
   }
 
@@ -390,4 +396,13 @@ export class Cells {
     cell.drop();
     if (this.all.delete(cell.key)) this.free.push(cell.number);
   }
+}
+
+function isNoCell(error: unknown): boolean {
+  return error instanceof ApiError && error.kind === "no_cell";
+}
+
+/** Whether the server says that it does not know a cell at a past moment, or not within its bounds. */
+function isUnknownThen(error: unknown): error is ApiError {
+  return error instanceof ApiError && (error.kind === "not_known" || error.kind === "too_costly");
 }
