@@ -149,7 +149,7 @@ law("one that moved up because another one went is no news", newLines() === 0);
 news.look(hot(17, 1.3, 5, 11), list(25, 6));
 law("one that comes before the last of the first is news", newLines() === 1 && news.items[0]?.text === "Hot spot now among the first 4, 40.0 °C");
 
-/** Whether the list is complete after each answer of a server; each asks for another threshold, which asks at once. */
+/** Completeness of the list after each answer of a server; another threshold is asked for at once. */
 async function completeAfter(...answers: (boolean | ApiError)[]): Promise<boolean[]> {
   const left = [...answers];
   const json = async () => {

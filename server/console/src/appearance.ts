@@ -86,7 +86,7 @@ export class Appearance {
     return { shift: shiftM, histogram: { least: least - zero, most: most - zero, begin: begin - zero, step, counts } };
   }
 
-  /** In what ages are told, and whether the log that is known here reaches back to all that is shown. */
+  /** Unit of ages, and reach of the log that is known here, for the legend. */
   private told(range: [number, number] | null): Told {
     const { head, all } = this.cells;
     const asks = this.look.field === "age" || this.look.field === "robot";
@@ -97,7 +97,7 @@ export class Appearance {
     return { ...ageUnit(range?.[1] ?? 0), ...known };
   }
 
-  /** What a floor plan is drawn with: the same field, and the ends of the whole map's temperatures. */
+  /** Field and ranges that a floor plan is drawn with: temperatures have the ends of the whole map's. */
   get planInk(): PlanInk {
     const locked = this.look.ranges.temperature;
     const rangeK = locked ? (locked.map((end) => end + KELVIN_ZERO_C) as [number, number]) : this.spread.range("temperature");

@@ -4,7 +4,7 @@ import { ApiError, type Api } from "./api.ts";
 import type { HotSpot, HotSpots, MapInfo } from "./messages.ts";
 import { KELVIN_ZERO_C } from "./units.ts";
 
-/** Spots of an answer: 10 kB. */
+/** Spots of an answer at most: 10 kB. */
 const COUNT = 30;
 /** Answers that go on from the one before, while a server has not read all of the map yet. */
 const TRIES = 100;
@@ -16,15 +16,15 @@ const COLD = "This map has no temperatures.";
 export class HotSpotList {
   onChange: () => void = () => {};
   spots: readonly HotSpot[] = [];
-  /** Of which these are the first. */
+  /** Number of spots in the map, of which `spots` are the first. */
   total = 0;
   /** `spots` are of a search through all of the map for what is above the threshold. */
   isComplete = false;
-  /** Why there is no list, or not all of it; empty: there is. */
+  /** Reason for which the list is missing or incomplete, in words; empty: it is complete. */
   said = "";
   /** Threshold of the list that is asked for, °C. */
   overC: number;
-  /** When to ask, as of performance.now(). */
+  /** Time of the next question, as of performance.now(). */
   private askAtMs = 0;
   private isAsking = false;
   private readonly api: Api;

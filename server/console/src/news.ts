@@ -143,7 +143,7 @@ export class NewsBook {
   }
 }
 
-/** Whether a spot stands before another one in the server's list. */
+/** True where a spot stands before another one in the server's list. */
 function isBefore(one: Finding, other: Finding): boolean {
   const [a, b] = [one.spot!, other.spot!];
   return a.confirmed === b.confirmed ? a.celsius > b.celsius : a.confirmed;

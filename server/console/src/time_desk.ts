@@ -15,7 +15,7 @@ import { openCommit } from "./ui/retract_dialog.ts";
 /** Entries of the log in one request. */
 const PAGE = 1000;
 
-/** What the desk does to the rest of the page. */
+/** Effects of the desk on the rest of the page. */
 export interface TimeActs {
   say(text: string): void;
   isOperator(): boolean;
@@ -135,7 +135,7 @@ export class TimeDesk {
     this.tell();
   }
 
-  /** A few times a second. */
+  /** Bring the axis up to date, and begin to look ahead; a few times a second. */
   tick(): void {
     this.tell();
     this.comparison.tick();
@@ -160,7 +160,7 @@ export class TimeDesk {
     this.preview.dispose();
   }
 
-  /** Where nothing is to be said but that the past is shown, and what of it is not known; empty: now is shown. */
+  /** Words that the past is shown, and how much of it is unknown; empty: now is shown. */
   get words(): string {
     const { atS } = this.look;
     if (atS === null) return "";
@@ -183,7 +183,7 @@ export class TimeDesk {
     this.strip.tell({ handles, total: this.cells.head, isReading: this.isReading });
   }
 
-  /** To the last moment at or before a time, once a frame. */
+  /** Move a handle to the last moment at or before a time, once a frame. */
   private scrub(handle: number, timeS: number | null): void {
     const isWaiting = this.wanted !== null;
     this.wanted = { handle, atS: timeS };
@@ -211,7 +211,7 @@ export class TimeDesk {
     });
   }
 
-  /** Entries before or after those that are here. */
+  /** Read entries of the log before or after those that are here. */
   private async read(older: boolean): Promise<void> {
     if (this.isReading) return;
     this.isReading = true;

@@ -1,4 +1,4 @@
-/** The map's cells as they are shown: what the server has, what lies on the graphics card, what is still to be fetched. */
+/** Cells of the map as they are shown: states of the server, nodes on the graphics card, and fetches that are still to come. */
 
 import { Box3, Group, Vector3, type Camera, type PerspectiveCamera, type Points, type ShaderMaterial } from "three";
 import { ApiError, NONE_READY, type Api, type CellAnswer, type ReadyViews } from "../api.ts";
@@ -35,7 +35,7 @@ export class Cells {
   head = 0;
   budget = 2_000_000;
   material: ShaderMaterial = squares;
-  /** When the whole map was there for the first time, if only coarsely; ms since the page began. */
+  /** Time at which the whole map was there first, if only coarsely; ms since the page began. */
   firstPictureMs: number | null = null;
   error: string | null = null;
   /** Other nodes are there, or others are wanted; `isWhole` says that no more are on their way to what was shown or asked for first. */
@@ -55,7 +55,7 @@ export class Cells {
   /** Turns to other moments so far: an answer that was asked for before the last of them is of another moment. */
   private turns = 0;
   private readonly past = new PastViews();
-  /** Why some cells are not known at the moment that is shown: the server's words. */
+  /** Reason for which some cells are unknown at the moment that is shown, in the server's words. */
   unknown: string | null = null;
 
   constructor(api: Api, info: MapInfo) {
@@ -90,7 +90,7 @@ export class Cells {
     this.onChange(false);
   }
 
-  /** Whose evidence is still in each cell, if some was taken out. */
+  /** Take over whose evidence is still in each cell, where some was taken out. */
   takeHeld(entries: readonly CellEntry[]): void {
     for (const { cell, lm, held_lm } of entries) {
       const shown = this.all.get(cell.join(","));
@@ -237,7 +237,7 @@ export class Cells {
     return this.running > 0;
   }
 
-  /** Whether `update` is worth calling though the eye did not move. */
+  /** `update` has something to do, though the eye did not move. */
   get needsPlan(): boolean {
     return !this.planned;
   }
@@ -322,7 +322,7 @@ export class Cells {
     else this.error = `cell ${cell.key}: ${error instanceof Error ? error.message : String(error)}`;
   }
 
-  /** Of this cell the moment that is shown is not known: it is not drawn, and not asked for again. */
+  /** Leave out a cell that is unknown at the moment that is shown: it is not asked for again. */
   private lacks(cell: ShownCell, why: string): void {
     cell.drop();
     cell.dirty = false;
@@ -339,7 +339,7 @@ export class Cells {
     return sum;
   }
 
-  /** One voxel that nobody sees: what the graphics card is made ready with. */
+  /** One voxel scaled to nothing, with which the graphics card is made ready. */
   sample(): Points {
     return samplePoints(this.material);
   }
@@ -363,7 +363,7 @@ export class Cells {
     this.group.add(points);
   }
 
-  /** Whether something is still pulsing because it changed. */
+  /** A cell still pulses because it changed. */
   get isFresh(): boolean {
     const nowMs = performance.now();
     for (const { freshMs } of this.all.values()) if (freshMs > nowMs) return true;

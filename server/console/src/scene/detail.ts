@@ -1,4 +1,4 @@
-/** Which octree depth each cell is shown at: coarse everywhere first, finer where the eye is, within a budget.
+/** Octree depths at which cells are shown: coarse everywhere first, finer where the eye is, within a budget.
  *
  *     one node a side  -->  all of the map coarsely  -->  the largest nodes of the picture finer  -->  what is finer already stays
  *
@@ -8,7 +8,7 @@
  * other depths are guessed from it. */
 
 export const GROWTH = 4.4;
-/** Finer than this nobody sees, px. */
+/** Size of a node below which no eye sees finer ones, px. */
 const NODE_PX = 1.6;
 /** A picture may hold so much more before cells are made coarser again, so that it does not flicker between two depths. */
 export const SLACK = 1.15;
@@ -80,7 +80,7 @@ export function plan(cells: readonly Candidate[], budget: number): number[] {
   let total = 0;
   for (const n of nearest) {
     const more = expected(cells[n], COARSEST);
-    if (total + more > budget) break; // whatever is farther is left out, too
+    if (total + more > budget) break; // all that is farther is left out, too
     depths[n] = COARSEST;
     total += more;
   }

@@ -15,7 +15,7 @@ export class ShownCell {
   digest = "";
   /** Log entry that last changed it. */
   lm = 0;
-  /** Newest entry whose evidence was still in it when `lm` had changed it; null: nobody asked. */
+  /** Newest entry whose evidence was still in it when `lm` had changed it; null: it was not asked for. */
   held: { lm: number; seq: number } | null = null;
   /** Nodes counted by depth; undefined: not yet. */
   counts: (number | undefined)[] = [];
@@ -27,13 +27,13 @@ export class ShownCell {
   depth = 0;
   wanted = 0;
   etag: string | null = null;
-  /** What is shown is not what the server has. */
+  /** The nodes that are drawn are not those that the server has. */
   dirty = true;
   busy = false;
   failedMs = NEVER_MS;
   /** Moment that is shown; empty: now. */
   momentKey = "";
-  /** What it held at that moment is not known any more. */
+  /** Its state at that moment is not known any more. */
   isUnknown = false;
   /** Until when it pulses, because it changed. */
   freshMs = 0;
@@ -51,7 +51,7 @@ export class ShownCell {
     this.box = new Box3(low, low.clone().add(this.sizeM));
   }
 
-  /** Whose evidence is the newest in it, as far as that is known. */
+  /** Log entry of the newest evidence in it, as far as that is known. */
   get heldLm(): number {
     return this.held?.lm === this.lm ? this.held.seq : this.lm;
   }
@@ -60,17 +60,17 @@ export class ShownCell {
     return this.bytes.length / STRIDE;
   }
 
-  /** Nothing in it is occupied, at whatever depth. */
+  /** No node in it is occupied, at whatever depth. */
   get isEmpty(): boolean {
     return this.etag !== null && this.count === 0 && this.counts.includes(0);
   }
 
-  /** What is shown is coarser or finer than wanted. */
+  /** It is drawn coarser or finer than wanted. */
   get isOff(): boolean {
     return this.depth !== this.wanted && !this.isEmpty && !this.isUnknown;
   }
 
-  /** What is shown is all that its depth has; where that changed, other depths are guessed to have changed alike. */
+  /** Take the number of nodes that are drawn as that of a depth; where it changed, other depths are guessed to have changed alike. */
   counted(depth: number): void {
     const before = this.counts[depth];
     if (before === 0 || (before && !this.count)) this.counts = [];

@@ -20,7 +20,7 @@ const PAPER_RATIO = 1.4;
 
 const NOTHING = "Nothing of this storey is in the map.";
 
-/** What the plan shows of the rest of the page, and does to it. */
+/** Parts of the page that the plan shows, and its effects on the page. */
 export interface PlanSource {
   ink(): PlanInk;
   findings(): readonly Finding[];
@@ -138,7 +138,7 @@ export class PlanPanel {
     this.tick();
   }
 
-  /** What lies in a storey's slab, and in the space above it up to the next floor. */
+  /** Findings and robots in a storey's slab, and in the space above it up to the next floor. */
   private marks(storey: number): PlanMarks {
     const { floorsM } = this.heights.storeys;
     const isHere = (place: Triple) => floorsM.length < 2 || storeyAt(floorsM, place[2]) === storey;
