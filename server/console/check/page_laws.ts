@@ -142,11 +142,12 @@ law("a list of another threshold is no news", newLines() === 0);
 news.look(hot(1.3, 5, 7, 11), list(25, 5));
 law("after all were listed another one is new, also where the list has the first alone", newLines() === 1 && news.items[0]?.text === "New hot spot, 37.0 °C");
 news.look(hot(1.3, 5, 7, 9), list(25, 5));
-news.look(hot(1.3, 5, 7, 11), list(25, 5));
-law("a hot spot that comes back into the first is no news", newLines() === 0);
-news.look(hot(1.3, 5, 11, 13), list(25, 5));
+news.look(hot(1.7, 5, 7, 11), list(25, 5));
+news.look(hot(2.1, 5, 7, 11), list(25, 5));
+law("a hot spot that comes back into the first, or moves on little by little, is no news", newLines() === 0);
+news.look(hot(2.1, 5, 11, 13), list(25, 5));
 law("one that moved up because another one went is no news", newLines() === 0);
-news.look(hot(17, 1.3, 5, 11), list(25, 6));
+news.look(hot(17, 2.1, 5, 11), list(25, 6));
 law("one that comes before the last of the first is news", newLines() === 1 && news.items[0]?.text === "Hot spot now among the first 4, 40.0 °C");
 
 /** Completeness of the list after each answer of a server; another threshold is asked for at once. */

@@ -60,11 +60,11 @@ interface KnownSpots {
 
 export class NewsBook {
   items: readonly NewsItem[] = [];
-  /** By robot, and what is taken out under no name. */
+  /** Lines that still count, by robot; that of all that is taken out has an empty name. */
   private readonly streaks = new Map<string, Streak>();
   /** Robots that are known, and what each said last. */
   private readonly notes = new Map<string, string>();
-  /** Null: no complete list of this threshold came yet. */
+  /** Hot spots in complete lists of this threshold; null: none came yet. */
   private hot: KnownSpots | null = null;
   private overC = NaN;
 
@@ -82,19 +82,19 @@ export class NewsBook {
     if (!isComplete) return;
     const spots = findings.filter(({ spot }) => spot);
     const known = this.hot;
-    const isKnown = (at: Triple) => known?.places.some((one) => Math.hypot(...one.map((value, n) => value - at[n])) < SAME_M);
-    const others = spots.filter(({ place }) => !isKnown(place));
+    const isAt = (places: readonly Triple[], at: Triple) => places.some((one) => Math.hypot(...one.map((value, n) => value - at[n])) < SAME_M);
     const places = spots.map(({ place }) => place);
     const hasAll = spots.length >= total || spots.length === 0;
     this.hot = {
       // Some that are known may be in the map still, after the last one that is listed.
-      places: hasAll ? places : [...others.map(({ place }) => place), ...(known?.places ?? [])].slice(0, PLACES_MAX),
+      places: hasAll ? places : [...places, ...(known?.places ?? []).filter((at) => !isAt(places, at))].slice(0, PLACES_MAX),
       last: hasAll ? null : spots.reduce((last, one) => (isBefore(last, one) ? one : last)),
     };
     if (!known) return;
-    for (const one of others) {
-      // What moved up because another one went was in the map before.
-      if (one.state !== "new" || (known.last && !isBefore(one, known.last))) continue;
+    for (const one of spots) {
+      if (one.state !== "new" || isAt(known.places, one.place)) continue;
+      // A spot that moved up because another one went was in the map before.
+      if (known.last && !isBefore(one, known.last)) continue;
       const words = known.last ? `Hot spot now among the first ${spots.length}` : "New hot spot";
       this.add(`${words}, ${one.celsius!.toFixed(1)} °C`, one.place, one.id);
     }
