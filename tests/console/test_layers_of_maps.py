@@ -36,6 +36,9 @@ GROUND_SHOWN = """[...c.cells.all.values()].flatMap((cell) => Array.from({ lengt
   return [x, y, heightM, difficulty, slopeDeg, stepM, cell.depth];
 }))"""
 """Column, height, difficulty, slope in degrees and step of each node."""
+COLOURED = 1
+"""Flag of nodes into which their ground is written: decode/pack.ts."""
+IS_UNWRITTEN = f"(bytes) => bytes.every((byte, n) => n % 12 !== 7 || !(byte & {COLOURED}))"
 
 
 def things_commit(n: int) -> Commit:
@@ -131,6 +134,61 @@ def test_a_level_is_drawn_as_the_ground_that_its_elevation_has(console: Console,
     flat = shown[shown[:, 0] < ground.RAMP]
     assert (flat[:, 2] > 1.7).sum() == len(ground.BRIDGE) * 6
     assert not ((flat[:, 2] > 1.1) & (flat[:, 2] < 1.3)).any()
+
+
+def test_what_is_written_into_the_ground_is_of_the_moment_that_is_shown_alone(console: Console) -> None:
+    """Moments at which a cell is the same share its bytes, as the server gave them."""
+    chosen(console, GROUND)
+    console.until("c.ground.seen === c.cells.shows", "the ground is known")
+    drawn = console.tell(GROUND_SHOWN)
+    # After the only commit nothing is another one.
+    console.tell("c.time.show(4e9)")
+    console.settled()
+    console.tell("c.time.show(null)")
+    console.settled()
+    console.until("c.ground.seen === c.cells.shows", "the ground is known again")
+    kept, cells = console.tell("[[...c.cells.past.views.values()], c.cells.all.size]")
+    assert len(kept) == 2 * cells, "of each cell two moments"
+    assert console.tell("c.cells.past.shares.size") == cells
+    assert console.tell(f"[...c.cells.past.views.values()].every({IS_UNWRITTEN})")
+    assert console.tell(GROUND_SHOWN) == drawn
+
+
+def test_a_cell_that_is_unknown_at_a_moment_keeps_no_other_from_being_fetched_ahead(console: Console) -> None:
+    chosen(console, GROUND)
+    page = console.page
+    first, *others = console.tell("(c.cells.past.forget(), [...c.cells.all.keys()])")
+    ahead = "c.cells.lookAhead({ atS: 4e9, key: 'then' }).catch(({ kind }) => kind)"
+    refusal = {"kind": "not_known", "title": "unknown", "detail": "that time is not kept apart"}
+    views = f"**/cells/{first}.view?*"
+    page.route(views, lambda route: route.abort())
+    assert console.tell(ahead) == "unreachable"
+    assert console.tell("c.cells.past.views.size") == 0, "a server that does not answer is asked once"
+    page.unroute(views)
+    page.route(views, lambda route: route.fulfill(status=409, json=refusal, content_type="application/problem+json"))
+    assert console.tell(ahead) is None
+    page.unroute(views)
+    console.errors.clear()  # the browser reports both answers
+    assert [name.split("/")[0] for name in console.tell("[...c.cells.past.views.keys()]")] == others
+
+
+def test_a_plan_and_a_report_have_the_ground_that_was_found_after_the_cells_came(console: Console) -> None:
+    chosen(console, GROUND)
+    console.until("c.ground.seen === c.cells.shows", "the ground is known")
+    console.until("c.plan.plan?.colours.some(Boolean)", "the plan has the ground")
+    report = "c.plan.pictures(120, 80).map(({ canvas }) => canvas.toDataURL())"
+    whole = console.tell(report)
+    unwritten = f"""(() => {{
+      for (const {{ bytes }} of c.cells.all.values()) {{
+        for (let at = 7; at < bytes.length; at += 12) bytes[at] &= ~{COLOURED};
+      }}
+      c.ground.madeOf = new WeakMap();
+      c.ground.seen = -1;
+    }})()"""
+    console.tell(f"({unwritten}, c.plan.madeOf = '', c.plan.nextMs = 0, c.plan.tick(), null)")
+    console.until("c.plan.plan?.colours.some(Boolean)", "the plan is made again")
+    console.tell(f"({unwritten}, null)")
+    assert console.tell(report) == whole
 
 
 def test_a_level_is_coloured_by_what_hinders_a_vehicle_and_asked_of_it(console: Console) -> None:

@@ -74,6 +74,19 @@ def test_the_plan_says_in_words_what_it_shows_and_a_click_flies_there(console: C
     assert console.errors == []
 
 
+def test_the_ink_of_a_plan_of_rooms_is_found_without_a_look_at_any_cell(console: Console) -> None:
+    """The page asks for it a few times a second."""
+    reads = """(() => {
+      const { cells } = c, { all } = cells;
+      let count = 0;
+      Object.defineProperty(cells, "all", { get: () => (count++, all), configurable: true });
+      const { range } = c.appearance.planInk;
+      Object.defineProperty(cells, "all", { value: all, configurable: true, writable: true, enumerable: true });
+      return [range, count];
+    })()"""
+    assert console.tell(reads) == [[0, 1], 0]
+
+
 def test_a_cell_without_room_in_the_picture_is_no_gap(console: Console) -> None:
     """Robots saw cells that the page leaves out for want of room."""
     before = console.tell("c.cells.budget")

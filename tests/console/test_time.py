@@ -30,6 +30,8 @@ LOGS = 200
 NOTE = "the head was knocked"
 SHOWN = "[...c.cells.all.values()].filter(({ count }) => count).map(({ key, bytes }) => [key, [...bytes]])"
 STRIDE = 12
+SLACK = 1.15
+"""Part of its budget of nodes up to which a picture may grow: `SLACK` of scene/detail.ts."""
 ROOM, FAR = 0.8, 6
 """Part of the map that has room: less than all at voxels, more than the first of its moments, so many steps back."""
 Nodes = dict[str, npt.NDArray[np.int64]]
@@ -131,6 +133,15 @@ def test_a_moment_seen_before_asks_the_server_for_nothing(console: Console) -> N
     assert [url for url in console.requests if "/main/cells" in url] == []
 
 
+def test_after_a_step_any_other_move_ends_the_look_ahead(console: Console) -> None:
+    """What is fetched ahead is where one more step would lead."""
+    for move in ("c.time.showNow()", "c.time.show(a[0])", "c.time.follow()"):
+        assert console.tell("(c.time.step(-1), c.time.isLookingAhead)")
+        assert not console.tell(f"({move}, c.time.isLookingAhead)", START_S)
+    console.tell("c.time.showNow()")
+    console.settled()
+
+
 def test_one_plan_of_depths_counts_for_all_moments_while_the_eye_rests(console: Console) -> None:
     budget, whole = console.tell("[c.cells.budget, c.cells.drawn]")
     console.tell("(c.cells.budget = a[0], c.replan())", int(ROOM * whole))
@@ -148,6 +159,20 @@ def test_one_plan_of_depths_counts_for_all_moments_while_the_eye_rests(console: 
         console.tell("c.time.step(a[0])", by)
         assert console.tell("c.cells.waiting") == 0, "it is there at once"
     assert [url for url in console.requests if "/main/cells" in url] == []
+    console.tell("(c.cells.budget = a[0], c.replan())", budget)
+    console.settled()
+    assert console.tell("c.cells.drawn") == whole
+
+
+def test_depths_that_were_chosen_for_an_emptier_moment_leave_now_within_its_budget(console: Console) -> None:
+    budget, whole = console.tell("[c.cells.budget, c.cells.drawn]")
+    console.tell("c.time.step(a[0])", -FAR)
+    console.tell("(c.cells.budget = a[0], c.replan())", int(ROOM * whole))
+    console.settled()
+    assert console.tell("Math.max(...[...c.cells.all.values()].map(({ depth }) => depth))") == GEOMETRY.depth
+    console.tell("c.time.step(a[0])", FAR)
+    console.settled()
+    assert 0 < console.tell("c.cells.drawn") <= SLACK * int(ROOM * whole)
     console.tell("(c.cells.budget = a[0], c.replan())", budget)
     console.settled()
     assert console.tell("c.cells.drawn") == whole

@@ -86,7 +86,7 @@ export class Appearance {
     return { shift: shiftM, histogram: { least: least - zero, most: most - zero, begin: begin - zero, step, counts } };
   }
 
-  /** In what ages are told, and whether the log that is known here reaches back to all that is shown. */
+  /** Unit of ages, and reach of the log that is known here, for the legend. */
   private told(range: [number, number] | null): Told {
     const { head, all } = this.cells;
     const asks = this.look.field === "age" || this.look.field === "robot";
@@ -97,15 +97,16 @@ export class Appearance {
     return { ...ageUnit(range?.[1] ?? 0), ...known };
   }
 
-  /** What a floor plan is drawn with: the same field, and the ends of the whole map's temperatures. */
+  /** Field and ranges that a floor plan is drawn with: temperatures have the ends of the whole map's. */
   get planInk(): PlanInk {
     const locked = this.look.ranges.temperature;
     const rangeK = locked ? (locked.map((end) => end + KELVIN_ZERO_C) as [number, number]) : this.spread.range("temperature");
     // A level's plan tells what hinders a vehicle, by whatever its picture is coloured.
     const isOfGround = this.look.field === "slope" || this.look.field === "step";
     const field = this.cells.isLevel && !isOfGround ? "difficulty" : this.look.field;
-    const range = this.look.ranges[field] ?? rangeOf(this.cells, field, -FAR_M, FAR_M) ?? [0, 1];
-    return { theme: document.documentElement.dataset.theme === "light" ? "light" : "dark", field, rangeK, range: this.cells.isLevel ? range : [0, 1] };
+    // A level's ranges are constants; another map's heights or temperatures would be sampled and sorted a few times a second.
+    const range: [number, number] = this.cells.isLevel ? (this.look.ranges[field] ?? rangeOf(this.cells, field, -FAR_M, FAR_M) ?? [0, 1]) : [0, 1];
+    return { theme: document.documentElement.dataset.theme === "light" ? "light" : "dark", field, rangeK, range };
   }
 
   /** Dark or light, as the page is. */

@@ -153,7 +153,7 @@ export class Console {
     left.append(this.dutyPanel.element, this.findings.panel.element, this.newsPanel.element, this.camera.element, this.team.panel.element, mapFacts(info));
     this.appearance = new Appearance(info, look, this.stage, this.cells, this.book, this.spread);
     view.append(this.appearance.legend.element);
-    this.plan = new PlanPanel(this.stage, this.cells, this.heights, {
+    this.plan = new PlanPanel({ stage: this.stage, cells: this.cells, ground: this.ground }, this.heights, {
       ink: () => this.appearance.planInk, findings: () => this.findings.all, robots: () => this.team.places,
       choose: (id) => this.findings.fly(id), go: (place) => this.camera.over(place),
     });
@@ -436,7 +436,7 @@ export class Console {
     this.duties.tick();
     this.findings.tick();
     this.measure.tick();
-    this.news.look(this.findings.all, this.findings.spots.isWhole);
+    this.news.look(this.findings.all, this.findings.spots);
     this.newsPanel.show(this.news.items);
     this.dutyPanel.show(this.duties);
     this.plan.tick();

@@ -8,6 +8,7 @@
  * A word counts while the spot's hottest voxel lies in the mark's box, and until it is `HOTTER_K` warmer than it was
  * said of: a lamp that was dismissed and burns is new. */
 
+import { robotOf } from "./log_book.ts";
 import { authorOf, boxOf, placeOf } from "./mark_book.ts";
 import type { HotSpot, MarkEntry, MarkText, Triple } from "./messages.ts";
 import { clock } from "./units.ts";
@@ -23,7 +24,7 @@ const SLACK_M = 0.25;
 export type State = "new" | "seen" | "dismissed" | "mark";
 
 export interface Finding {
-  /** The same while it is the same thing. */
+  /** Id that stays the same as long as the thing does. */
   readonly id: string;
   readonly number: number;
   readonly state: State;
@@ -75,7 +76,7 @@ export function wordsAround(spot: HotSpot, marks: readonly MarkEntry[]): MarkEnt
   return marks.filter((entry) => isWord(entry.mark.kind) && holds(entry, spot.point_m));
 }
 
-/** What a new mark of a spot says at first. */
+/** First text of a new mark of a spot. */
 export function markOfSpot(spot: HotSpot): MarkText {
   return { kind: HOT_SPOT, name: `Hot spot, ${spot.celsius.toFixed(1)} °C`, ...boxText(spot) };
 }
@@ -87,7 +88,7 @@ export function factsOf({ spot, entry, state }: Finding): string {
     if (spot.over_floor_m !== null) parts.push(`${spot.over_floor_m.toFixed(1)} m over the floor`);
     parts.push(`${spot.voxels} voxel${spot.voxels === 1 ? "" : "s"}`);
     if (!spot.confirmed) parts.push("perhaps a ghost");
-    if (spot.commit) parts.push(`by ${spot.commit.split(".")[0]}`);
+    if (spot.commit) parts.push(`by ${robotOf(spot.commit)}`);
     const timeS = spot.captured_s?.[1] ?? spot.measured_s;
     if (timeS !== undefined) parts.push(clock(timeS));
   }

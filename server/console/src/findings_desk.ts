@@ -7,6 +7,7 @@ import { Attachments } from "./attachments.ts";
 import { csvOf, geoJsonOf } from "./findings_files.ts";
 import { HotSpotList } from "./hot_spot_list.ts";
 import type { CameraView, Look } from "./look.ts";
+import { mapOf } from "./map_layers.ts";
 import { MarkBook } from "./mark_book.ts";
 import type { LiveEvent, MapInfo, MarkText, Triple } from "./messages.ts";
 import { h } from "./dom.ts";
@@ -26,10 +27,10 @@ const THRESHOLD_KEY = "cairn.hot";
 const WARM_C = 30;
 /** Flights to one thing: a nearer eye gets finer voxels, and what these show may stand in the way. */
 const FLIGHTS_MAX = 4;
-/** What is picked in the middle counts as the thing if it is within so many voxels of it. */
+/** Distance from a thing within which the node in the middle of the picture counts as it, voxels. */
 const NEAR_VOXELS = 2.5;
 
-/** What the desk does to the rest of the page. */
+/** Effects of the desk on the rest of the page. */
 export interface DeskActs {
   fly(view: CameraView): void;
   /** The look was changed. */
@@ -56,7 +57,7 @@ export class FindingsDesk {
   chosen: string | null = null;
   /** A flight whose end is still to be looked at. */
   private flight: { place: Vector3; witness: Vector3 | null; left: number } | null = null;
-  /** What a link names, until it is there. */
+  /** Finding that a link names, until it is there. */
   private sought: { id: string; endMs: number } | null = null;
   private readonly attachments: Attachments;
   private said = "";
@@ -76,10 +77,11 @@ export class FindingsDesk {
     this.look = look;
     this.acts = acts;
     const overC = Number(localStorage.getItem(THRESHOLD_KEY) ?? WARM_C);
-    this.attachments = new Attachments(api, info.name.split(".")[0]!);
+    const map = mapOf(info.name); // marks and their files are the map's, also where one of its layers is shown
+    this.attachments = new Attachments(api, map);
     this.panel = new FindingsPanel(overC, this.alarm.element, this.attachments);
     this.pins = new Pins(this.stage);
-    this.marks = new MarkBook(api, info.name.split(".")[0]!); // marks are the map's, also where one of its layers is shown
+    this.marks = new MarkBook(api, map);
     this.spots = new HotSpotList(api, info, overC);
     this.marks.onChange = this.spots.onChange = () => this.update();
     this.panel.onFly = this.pins.onChoose = this.alarm.onFly = (id) => this.fly(id);

@@ -1,6 +1,7 @@
 /** Findings as files for other programs, in metres of the map's frame. */
 
 import type { Finding } from "./findings.ts";
+import { robotOf } from "./log_book.ts";
 import { authorOf } from "./mark_book.ts";
 
 const COLUMNS = [
@@ -17,7 +18,7 @@ function rowOf({ number, state, title, place, box, celsius, spot, entry }: Findi
     x_m: metric(place[0]), y_m: metric(place[1]), z_m: metric(place[2]), over_floor_m: spot?.over_floor_m ?? null, voxels: spot?.voxels ?? null,
     low_x_m: metric(low[0]), low_y_m: metric(low[1]), low_z_m: metric(low[2]),
     high_x_m: metric(high[0]), high_y_m: metric(high[1]), high_z_m: metric(high[2]),
-    author: entry ? authorOf(entry) : (spot?.commit?.split(".")[0] ?? null),
+    author: entry ? authorOf(entry) : (spot?.commit ? robotOf(spot.commit) : null),
     time_utc: timeS === undefined ? null : new Date(timeS * 1000).toISOString(), note: entry?.mark.note ?? null, key: entry?.key ?? null,
   };
 }

@@ -4,7 +4,7 @@ import { ApiError, type Api } from "./api.ts";
 import type { HotSpot, HotSpots, MapInfo } from "./messages.ts";
 import { KELVIN_ZERO_C } from "./units.ts";
 
-/** Spots of an answer: 10 kB. */
+/** Spots of an answer at most: 10 kB. */
 const COUNT = 30;
 /** Answers that go on from the one before, while a server has not read all of the map yet. */
 const TRIES = 100;
@@ -16,14 +16,15 @@ const COLD = "This map has no temperatures.";
 export class HotSpotList {
   onChange: () => void = () => {};
   spots: readonly HotSpot[] = [];
-  /** Of which these are the first. */
+  /** Number of spots in the map, of which `spots` are the first. */
   total = 0;
-  /** All of the map was looked through for what is above the threshold. */
-  isWhole = false;
-  /** Why there is no list, or not all of it; empty: there is. */
+  /** `spots` are of a search through all of the map for what is above the threshold. */
+  isComplete = false;
+  /** Reason for which the list is missing or incomplete, in words; empty: it is complete. */
   said = "";
-  private overC: number;
-  /** When to ask, as of performance.now(). */
+  /** Threshold of the list that is asked for, °C. */
+  overC: number;
+  /** Time of the next question, as of performance.now(). */
   private askAtMs = 0;
   private isAsking = false;
   private readonly api: Api;
@@ -48,7 +49,7 @@ export class HotSpotList {
   setThreshold(overC: number): void {
     if (overC === this.overC) return;
     this.overC = overC;
-    this.isWhole = false;
+    this.isComplete = false;
     this.askAtMs = 0;
   }
 
@@ -70,7 +71,7 @@ export class HotSpotList {
       const found = await this.api.json<HotSpots>(`maps/${this.map}/main/hotspots?over_k=${overK}&count=${COUNT}`);
       this.spots = found.spots;
       this.total = found.total;
-      this.isWhole = found.complete && overC === this.overC;
+      this.isComplete = found.complete && overC === this.overC;
       this.said = found.complete ? "" : "The server is still looking through the map.";
       this.tries = found.complete ? 0 : this.tries + 1;
       if (!found.complete && this.tries < TRIES) this.askAtMs = this.nextMs;
@@ -88,6 +89,7 @@ export class HotSpotList {
     if (kind === "unknown_channel" || kind === "no_route" || kind === "too_costly") {
       this.spots = [];
       this.total = 0;
+      this.isComplete = false;
       this.said =
         kind === "unknown_channel" ? COLD
         : kind === "no_route" ? "This server is older than lists of hot spots."

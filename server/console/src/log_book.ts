@@ -1,4 +1,4 @@
-/** What the page knows of the map's log: whose commits changed what, when that was measured, and from where.
+/** Log of the map as far as the page knows it: whose commits changed what, when that was measured, and from where.
  *
  * The newest entries come first and are enough for most maps; older ones are read as far back as a shown cell needs
  * them, within a bound. What is known for sure is the run without a gap that ends at the newest entry: a page of the
@@ -12,9 +12,10 @@ const PAGE = 1000;
 /** Entries that are kept: some 4 MB. */
 export const KEPT = 20_000;
 
+/** Robot, or `operator`, of a commit's id or a mark's key. */
 export const robotOf = (id: string): string => id.split(".")[0];
 
-/** Where a robot was, m in the map, and when, by its own clock. */
+/** Place of a robot, m in the map, and the time, by its own clock. */
 export interface Place {
   readonly timeS: number;
   readonly at: Triple;
@@ -23,7 +24,7 @@ export interface Place {
 interface Known {
   readonly seq: number;
   readonly id: string;
-  /** It took evidence out. */
+  /** The entry took evidence out. */
   readonly isOut: boolean;
   readonly timeS: number | null;
   readonly at: Triple | null;
@@ -103,7 +104,7 @@ export class LogBook {
     this.onChange();
   }
 
-  /** Whose commit a log entry folded; null: it took one out, or is older than those that are known here. */
+  /** Robot whose commit a log entry folded; null: it took one out, or is older than those that are known here. */
   robotAt(seq: number): string | null {
     const entry = this.known.get(seq);
     return entry && !this.isOut(seq) ? robotOf(entry.id) : null;

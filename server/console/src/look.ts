@@ -99,7 +99,7 @@ export function toHash(map: string, look: Look, camera: CameraView | null, find:
 
 /** Numbers of a list; none, unless each is one. */
 function numbersOf(text: string | undefined): number[] {
-  const found = text ? text.split(",").map(Number) : [];
+  const found = text ? text.split(",").map((part) => (part.trim() ? Number(part) : NaN)) : [];
   return found.every(Number.isFinite) ? found : [];
 }
 

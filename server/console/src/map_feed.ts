@@ -1,6 +1,6 @@
-/** What flows from the server into one map's picture: the index of its cells, its log, and live events.
+/** Feed of one map from the server: the index of its cells, its log, and live events.
  *
- *     live link  -->  events: cells, log, robots, marks  -->  those who show them
+ *     live link  -->  events: cells, log, robots, marks  -->  takers, which show them
  *                 \-  the log may be another one, or too much changed  -->  index and newest entries once more */
 
 import { NONE_READY, type Api } from "./api.ts";
@@ -17,7 +17,7 @@ import { SHOWN, type CommitStrip } from "./ui/commit_strip.ts";
 /** From a load that failed to the next one. */
 const AGAIN_MS = 3000;
 
-/** Those who show what comes. */
+/** Parts of the page that show what comes. */
 export interface FeedTakers {
   readonly cells: Cells;
   readonly book: LogBook;
@@ -38,12 +38,12 @@ export interface FeedActs {
 
 export class MapFeed {
   state: LinkState = { live: false, heardMs: null };
-  /** State that the index was last taken from; empty: none came yet. */
+  /** State of the map that the index was last taken from; empty: none came yet. */
   cursor = "";
   private readonly link: LiveLink;
   private isAsking = false;
   private loading: Promise<void>;
-  /** When to load again what could not be loaded, as of performance.now(). */
+  /** Time of the next try to load what could not be loaded, as of performance.now(). */
   private againAtMs = Infinity;
   private readonly api: Api;
   private readonly info: MapInfo;
@@ -64,14 +64,14 @@ export class MapFeed {
     this.loading = this.reload();
   }
 
-  /** A few times a second: what could not be loaded is tried again. */
+  /** Try again what could not be loaded; a few times a second. */
   tick(): void {
     if (performance.now() < this.againAtMs) return;
     this.againAtMs = Infinity;
     void this.reload();
   }
 
-  /** Ask whose evidence is left in cells of which some was taken out last: the log alone does not tell. */
+  /** Ask whose evidence is left in cells that a retract changed last, which the log does not say. */
   async askHeld(): Promise<void> {
     const { cells, book } = this.takers;
     if (this.isAsking || ![...cells.all.values()].some(({ lm, held }) => held?.lm !== lm && book.isOut(lm))) return;
@@ -110,14 +110,14 @@ export class MapFeed {
     }
   }
 
-  /** The same where the server cannot prove that its log is the one that is known here: a part of that may be lost. */
+  /** Load everything, and forget the log: the server cannot prove that its own is the one that is known here, of which a part may be lost. */
   private reloadAll(): Promise<void> {
     this.takers.book.forget();
     this.takers.strip.forget();
     return this.reload();
   }
 
-  /** Everything once more: what the page has of it stays. */
+  /** Load everything once more; cells that did not change stay. */
   private async reload(): Promise<void> {
     const { cells, book, team } = this.takers;
     try {

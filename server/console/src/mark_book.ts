@@ -5,6 +5,7 @@
  * A mark never moves: an edit is another mark whose commit took the old one out. */
 
 import type { Api } from "./api.ts";
+import { robotOf } from "./log_book.ts";
 import type { MarkEntry, MarkPage, MarkText, Triple } from "./messages.ts";
 
 const PAGE = 1000;
@@ -20,7 +21,7 @@ export class MarkBook {
   private cursor: string | null = null;
   private reading: Promise<void> | null = null;
   private again = false;
-  /** What was heard while a page was on its way, which may be older. */
+  /** Marks that events brought while a page, which may be older, was on its way. */
   private heard: (() => void)[] = [];
   private timer = 0;
   private readonly api: Api;
@@ -106,9 +107,9 @@ function commitOf(key: string): string {
   return key.slice(0, key.lastIndexOf(":"));
 }
 
-/** Who speaks: the person or robot that an operator's commit names, else its robot. */
+/** Author of a mark: the person or robot that an operator's commit names, else the robot of its commit. */
 export function authorOf({ key, mark }: MarkEntry): string {
-  return mark.by || key.split(".")[0];
+  return mark.by || robotOf(key);
 }
 
 export function placeOf({ mark }: MarkEntry): Triple {

@@ -20,7 +20,7 @@ import { isOffline, TeamPanel } from "./ui/team_panel.ts";
 const REFRESH_MS = 10_000;
 const SOON_MS = 1000;
 const OFFLINE_COLOUR = "#8b949e";
-/** Where the eye is that follows a robot, m: so far behind it and over it, or nearer, this far before what is in the way. */
+/** Place of the eye that follows a robot, m: so far behind it and over it, or nearer, this far before what is in the way. */
 const BEHIND_M = 3;
 const OVER_M = 2.2;
 const NEAREST_M = 0.3;
@@ -55,7 +55,7 @@ export class Team {
     this.stage = stage;
     this.cells = cells;
     this.picture = new RobotPicture(api, map);
-    this.fromPose = new RobotMap(api, map);
+    this.fromPose = new RobotMap(api, map, cells.isLevel);
     this.panel.onFollow = (robot) => this.follow(this.followed === robot ? null : robot);
   }
 
@@ -110,7 +110,7 @@ export class Team {
     this.onFollow();
   }
 
-  /** Where the eye sees a robot from behind, with nothing that is shown between them. */
+  /** Place from which the eye sees a robot from behind, with nothing that is shown between them. */
   private behind(robot: Vector3, ahead: Vector3): Vector3 {
     const back = (ahead.lengthSq() > 0.01 ? ahead.normalize() : new Vector3(0, 1, 0)).multiplyScalar(-BEHIND_M).setZ(OVER_M);
     const wantedM = back.length();
@@ -119,12 +119,12 @@ export class Team {
     return robot.clone().addScaledVector(back, awayM / wantedM);
   }
 
-  /** Where robots stand that told it. */
+  /** Places of robots that reported one. */
   get places(): { name: string; place: Triple; colour: string }[] {
     return [...this.marks].flatMap(([name, { position }]) => (position ? [{ name, place: position.toArray() as Triple, colour: robotColour(name, this.names) }] : []));
   }
 
-  /** Where the robot next to a place stands; null: no robot told. */
+  /** Place of the robot nearest to a place; null: no robot reported one. */
   nearest(place: Vector3): Vector3 | null {
     const places = [...this.marks.values()].flatMap(({ position }) => (position ? [position] : []));
     places.sort((a, b) => a.distanceTo(place) - b.distanceTo(place));
@@ -136,7 +136,7 @@ export class Team {
     this.full = full;
     const followed = this.followed === null ? undefined : this.signs.get(this.followed);
     this.picture.show(this.followed, followed?.view_s ?? null);
-    this.fromPose.show(this.followed, this.cells.isLevel ? null : (followed?.status?.pose ?? null), field, head);
+    this.fromPose.show(this.followed, followed?.status?.pose ?? null, field, head);
     if (performance.now() >= this.askAtMs) {
       this.askAtMs = performance.now() + REFRESH_MS;
       void this.ask();

@@ -15,7 +15,7 @@ import { openCommit } from "./ui/retract_dialog.ts";
 /** Entries of the log in one request. */
 const PAGE = 1000;
 
-/** What the desk does to the rest of the page. */
+/** Effects of the desk on the rest of the page. */
 export interface TimeActs {
   say(text: string): void;
   isOperator(): boolean;
@@ -32,9 +32,10 @@ export class TimeDesk {
   private isReading = false;
   /** A handle that is dragged moves more often than frames are drawn. */
   private wanted: { handle: number; atS: number | null } | null = null;
-  /** Who steps goes on that way: what comes next is fetched before it is asked for. `undefined`: nothing is to be. */
+  /** Moment that one more step would show, which is fetched once all that is shown is there; undefined: none. */
   private ahead: { atS: number | null } | undefined;
-  isLookingAhead = false;
+  /** Moments that are fetched ahead at present. */
+  private fetchesAhead = 0;
   private readonly api: Api;
   private readonly info: MapInfo;
   private readonly look: Look;
@@ -68,6 +69,7 @@ export class TimeDesk {
   /** The map as it was at a time, by capture; null: now. */
   show(atS: number | null): void {
     const moment = atS === null ? null : this.timeline.momentAt(atS);
+    this.ahead = undefined;
     this.look.atS = moment?.atS ?? null;
     if (this.look.sinceS !== null && atS !== null) this.look.sinceS = Math.min(this.look.sinceS, atS);
     this.cells.showMoment(moment);
@@ -105,8 +107,12 @@ export class TimeDesk {
     const next = this.next(isFirst ? this.look.sinceS : this.look.atS, by);
     if (isFirst) return this.since(next);
     this.show(next);
-    this.isLookingAhead = Number.isFinite(by) && (next !== null || by < 0);
-    this.ahead = this.isLookingAhead ? { atS: this.next(next, by) } : undefined;
+    if (Number.isFinite(by) && (next !== null || by < 0)) this.ahead = { atS: this.next(next, by) };
+  }
+
+  /** A moment is fetched that is not shown yet, or is about to be. */
+  get isLookingAhead(): boolean {
+    return this.ahead !== undefined || this.fetchesAhead > 0;
   }
 
   /** Moment so many further on; null: now. */
@@ -129,7 +135,7 @@ export class TimeDesk {
     this.tell();
   }
 
-  /** A few times a second. */
+  /** Bring the axis up to date, and begin to look ahead; a few times a second. */
   tick(): void {
     this.tell();
     this.comparison.tick();
@@ -138,12 +144,13 @@ export class TimeDesk {
 
   private async lookAhead(atS: number | null): Promise<void> {
     this.ahead = undefined;
+    this.fetchesAhead++;
     try {
       await this.cells.lookAhead(atS === null ? null : this.timeline.momentAt(atS));
     } catch {
-      // Whoever goes there hears why it is not known.
+      // The step that shows it asks again, and says why it is not there.
     } finally {
-      this.isLookingAhead = this.ahead !== undefined;
+      this.fetchesAhead--;
     }
   }
 
@@ -153,7 +160,7 @@ export class TimeDesk {
     this.preview.dispose();
   }
 
-  /** Where nothing is to be said but that the past is shown, and what of it is not known; empty: now is shown. */
+  /** Words that the past is shown, and how much of it is unknown; empty: now is shown. */
   get words(): string {
     const { atS } = this.look;
     if (atS === null) return "";
@@ -176,7 +183,7 @@ export class TimeDesk {
     this.strip.tell({ handles, total: this.cells.head, isReading: this.isReading });
   }
 
-  /** To the last moment at or before a time, once a frame. */
+  /** Move a handle to the last moment at or before a time, once a frame. */
   private scrub(handle: number, timeS: number | null): void {
     const isWaiting = this.wanted !== null;
     this.wanted = { handle, atS: timeS };
@@ -204,7 +211,7 @@ export class TimeDesk {
     });
   }
 
-  /** Entries before or after those that are here. */
+  /** Read entries of the log before or after those that are here. */
   private async read(older: boolean): Promise<void> {
     if (this.isReading) return;
     this.isReading = true;

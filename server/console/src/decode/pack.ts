@@ -15,7 +15,7 @@ export const COLOURED = 1;
 export const WARM = 2;
 export const HEAT_STEP_K = 0.02;
 export const HEAT_ZERO_K = 150;
-/** Of a level's nodes, one byte each: steps of difficulty, slope in degrees and step in m; and the slope that is not known. */
+/** Units of the bytes in which a level's node has difficulty, slope and step; and the byte of an unknown slope. */
 export const DIFFICULTY_STEP = 0.01;
 export const SLOPE_STEP_DEG = 0.25;
 export const RISE_STEP_M = 0.004;

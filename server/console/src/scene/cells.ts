@@ -1,11 +1,11 @@
-/** The map's cells as they are shown: what the server has, what lies on the graphics card, what is still to be fetched. */
+/** Cells of the map as they are shown: states of the server, nodes on the graphics card, and fetches that are still to come. */
 
 import { Box3, Group, Vector3, type Camera, type PerspectiveCamera, type Points, type ShaderMaterial } from "three";
 import { ApiError, NONE_READY, type Api, type CellAnswer, type ReadyViews } from "../api.ts";
 import type { CellEntry, MapInfo, Triple } from "../messages.ts";
 import type { Moment } from "../timeline.ts";
 import { Decoders } from "./decoders.ts";
-import { COARSE, plan } from "./detail.ts";
+import { COARSE, plan, StandingPlan } from "./detail.ts";
 import { squares, uniforms } from "./materials.ts";
 import { PastViews } from "./past_views.ts";
 import { NEVER_MS, samplePoints, ShownCell } from "./shown_cell.ts";
@@ -35,7 +35,7 @@ export class Cells {
   head = 0;
   budget = 2_000_000;
   material: ShaderMaterial = squares;
-  /** When the whole map was there for the first time, if only coarsely; ms since the page began. */
+  /** Time at which the whole map was there first, if only coarsely; ms since the page began. */
   firstPictureMs: number | null = null;
   error: string | null = null;
   /** Other nodes are there, or others are wanted; `isWhole` says that no more are on their way to what was shown or asked for first. */
@@ -48,16 +48,14 @@ export class Cells {
   private readonly api: Api;
   private readonly map: string;
   private planned = false;
-  /** View of the last plan, and that for which depths stay as they are at whatever moment; empty: none. */
-  private view = "";
-  private settledView = "";
+  private readonly standing = new StandingPlan();
   private ready = NONE_READY;
   /** Moment that is shown, or on its way; null: now. */
   private moment: Moment | null = null;
   /** Turns to other moments so far: an answer that was asked for before the last of them is of another moment. */
   private turns = 0;
   private readonly past = new PastViews();
-  /** Why some cells are not known at the moment that is shown: the server's words. */
+  /** Reason for which some cells are unknown at the moment that is shown, in the server's words. */
   unknown: string | null = null;
 
   constructor(api: Api, info: MapInfo) {
@@ -74,7 +72,7 @@ export class Cells {
   /** Take over the whole index: what differs from what is shown is taken from `ready` or fetched, what is gone goes. */
   takeIndex(entries: readonly CellEntry[], ready: ReadyViews): void {
     this.ready = ready;
-    this.settledView = "";
+    this.standing.release();
     const there = new Set<string>();
     // Entries of another log may have the same numbers.
     this.past.forget();
@@ -92,7 +90,7 @@ export class Cells {
     this.onChange(false);
   }
 
-  /** Whose evidence is still in each cell, if some was taken out. */
+  /** Take over whose evidence is still in each cell, where some was taken out. */
   takeHeld(entries: readonly CellEntry[]): void {
     for (const { cell, lm, held_lm } of entries) {
       const shown = this.all.get(cell.join(","));
@@ -108,19 +106,18 @@ export class Cells {
     shown.digest = "";
     shown.dirty = true;
     this.head = Math.max(this.head, lm);
-    this.settledView = "";
+    this.standing.release();
     this.planned = false;
   }
 
   /** Show the map as it was at a moment; null: as it is. What was shown before is kept, so the way back is short. */
   showMoment(moment: Moment | null): void {
     if (moment?.key === this.moment?.key) return;
-    // One plan for all moments: of two, each moment would want some cells at depths that it was not seen at before.
-    if (this.planned && !this.waiting) this.settledView = this.view;
+    if (this.planned && !this.waiting) this.standing.keep();
     if (!this.moment) {
       for (const cell of this.all.values()) {
         // Of a busy cell that changed the old bytes are still shown: under the name of its new state they would come back as now.
-        if (!cell.dirty && !cell.busy && cell.etag !== null) this.past.put(...this.nameOf(cell, cell.depth), cell.bytes);
+        if (!cell.dirty && !cell.busy && cell.etag !== null) this.past.put(...this.nameOf(cell, cell.depth), cell.source);
       }
     }
     this.moment = moment;
@@ -135,7 +132,7 @@ export class Cells {
       if (!bytes) continue;
       cell.momentKey = this.momentKey;
       cell.etag = "";
-      if (bytes === cell.bytes) continue;
+      if (bytes === cell.source) continue;
       this.show(cell, bytes, depth);
       cell.counted(depth);
     }
@@ -143,15 +140,21 @@ export class Cells {
     this.onChange(true);
   }
 
-  /** Fetch what another moment shows, cell by cell, until a third one is turned to; null: now. */
+  /** Fetch all cells as they are at a moment that is not shown yet, one by one, and keep them; null: now. Ends early when the moment that is shown changes.
+   *
+   * A cell that the server does not know at that moment is left out. Throws `ApiError` where the server cannot be asked for more. */
   async lookAhead(moment: Moment | null): Promise<void> {
     const { turns } = this;
     for (const cell of [...this.all.values()]) {
       const depth = cell.depth || cell.wanted;
       const name: [string, string] = [`${cell.key}/${depth}`, `${cell.lm}/${moment?.key ?? ""}`];
       if (!depth || this.past.has(...name)) continue;
-      const { data } = await this.api.view(this.map, cell.key, depth, { etag: null, atS: moment?.atS ?? null });
-      if (data) this.past.put(...name, await this.decoders.decode(data));
+      try {
+        const { data } = await this.api.view(this.map, cell.key, depth, { etag: null, atS: moment?.atS ?? null });
+        if (data) this.past.put(...name, await this.decoders.decode(data));
+      } catch (error) {
+        if (!isUnknownThen(error) && !isNoCell(error)) throw error;
+      }
       if (turns !== this.turns) return;
     }
   }
@@ -161,7 +164,7 @@ export class Cells {
     return this.moment?.key ?? "";
   }
 
-  /** Of what a cell is at a depth and at the moment that is shown. */
+  /** Name of a cell's nodes at a depth and at the moment that is shown. */
   private nameOf(cell: ShownCell, depth: number): [string, string] {
     return [`${cell.key}/${depth}`, `${cell.lm}/${this.momentKey}`];
   }
@@ -204,14 +207,14 @@ export class Cells {
 
   /** Choose depths for where the eye is, and fetch what is missing. */
   update(camera: PerspectiveCamera, heightPx: number, frustum: { intersectsBox(box: Box3): boolean }): void {
-    this.view = JSON.stringify([camera.matrixWorld.elements, camera.projectionMatrix.elements, heightPx, this.budget]);
-    if (this.view !== this.settledView) this.choose(camera, heightPx, frustum);
+    const view = JSON.stringify([camera.matrixWorld.elements, camera.projectionMatrix.elements, heightPx, this.budget]);
+    if (this.standing.isDue(view, this.drawn, this.budget)) this.choose(camera, heightPx, frustum);
     this.planned = true;
     this.fetchMore();
   }
 
   private choose(camera: PerspectiveCamera, heightPx: number, frustum: { intersectsBox(box: Box3): boolean }): void {
-    this.settledView = "";
+    this.standing.note(this.moment === null);
     const cells = [...this.all.values()];
     const pxPerRad = heightPx / (2 * Math.tan((camera.fov * Math.PI) / 360));
     const candidates = cells.map((cell) => {
@@ -234,7 +237,7 @@ export class Cells {
     return this.running > 0;
   }
 
-  /** Whether `update` is worth calling though the eye did not move. */
+  /** `update` has something to do, though the eye did not move. */
   get needsPlan(): boolean {
     return !this.planned;
   }
@@ -314,12 +317,12 @@ export class Cells {
     cell.failedMs = performance.now();
     window.setTimeout(() => this.onChange(false), RETRY_MS);
     if (error instanceof ApiError && error.wantsToken) this.onRefused();
-    else if (error instanceof ApiError && error.kind === "no_cell") this.remove(cell);
-    else if (this.moment && error instanceof ApiError && (error.kind === "not_known" || error.kind === "too_costly")) this.lacks(cell, error.message);
+    else if (isNoCell(error)) this.remove(cell);
+    else if (this.moment && isUnknownThen(error)) this.lacks(cell, error.message);
     else this.error = `cell ${cell.key}: ${error instanceof Error ? error.message : String(error)}`;
   }
 
-  /** Of this cell the moment that is shown is not known: it is not drawn, and not asked for again. */
+  /** Leave out a cell that is unknown at the moment that is shown: it is not asked for again. */
   private lacks(cell: ShownCell, why: string): void {
     cell.drop();
     cell.dirty = false;
@@ -336,7 +339,7 @@ export class Cells {
     return sum;
   }
 
-  /** One voxel that nobody sees: what the graphics card is made ready with. */
+  /** One voxel scaled to nothing, with which the graphics card is made ready. */
   sample(): Points {
     return samplePoints(this.material);
   }
@@ -360,7 +363,7 @@ export class Cells {
     this.group.add(points);
   }
 
-  /** Whether something is still pulsing because it changed. */
+  /** A cell still pulses because it changed. */
   get isFresh(): boolean {
     const nowMs = performance.now();
     for (const { freshMs } of this.all.values()) if (freshMs > nowMs) return true;
@@ -381,7 +384,7 @@ export class Cells {
     const key = cell.join(",");
     let shown = this.all.get(key);
     if (!shown) {
-      shown = new ShownCell(cell, this.edgeM, this.heightM, this.free.pop() ?? this.byNumber.length);
+      shown = new ShownCell(cell, this, this.free.pop() ?? this.byNumber.length);
       this.byNumber[shown.number] = shown;
       this.all.set(key, shown);
     }
@@ -389,8 +392,17 @@ export class Cells {
   }
 
   private remove(cell: ShownCell): void {
-    this.settledView = "";
+    this.standing.release();
     cell.drop();
     if (this.all.delete(cell.key)) this.free.push(cell.number);
   }
+}
+
+function isNoCell(error: unknown): boolean {
+  return error instanceof ApiError && error.kind === "no_cell";
+}
+
+/** Whether the server says that it does not know a cell at a past moment, or not within its bounds. */
+function isUnknownThen(error: unknown): error is ApiError {
+  return error instanceof ApiError && (error.kind === "not_known" || error.kind === "too_costly");
 }

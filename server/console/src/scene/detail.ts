@@ -1,4 +1,4 @@
-/** Which octree depth each cell is shown at: coarse everywhere first, finer where the eye is, within a budget.
+/** Octree depths at which cells are shown: coarse everywhere first, finer where the eye is, within a budget.
  *
  *     one node a side  -->  all of the map coarsely  -->  the largest nodes of the picture finer  -->  what is finer already stays
  *
@@ -8,7 +8,7 @@
  * other depths are guessed from it. */
 
 export const GROWTH = 4.4;
-/** Finer than this nobody sees, px. */
+/** Size of a node below which no eye sees finer ones, px. */
 const NODE_PX = 1.6;
 /** A picture may hold so much more before cells are made coarser again, so that it does not flicker between two depths. */
 export const SLACK = 1.15;
@@ -40,6 +40,39 @@ export function expected(cell: Candidate, depth: number): number {
   return Math.min(60 * GROWTH ** (depth - 3), most);
 }
 
+/** Plan of depths that is kept at other moments: one that was made of the map as it is now, while the eye rests and what it draws has room.
+ *
+ * With a plan for each moment, some cells would be wanted at depths that they were not seen at before. A plan that was made of the
+ * past is not kept: a cell that was empty costs nothing at its voxels, and may be full at another moment. */
+export class StandingPlan {
+  /** View of the last plan, and the one for which depths stay as they are; empty: none. */
+  private view = "";
+  private keptView = "";
+  private isOfNow = false;
+
+  /** Take over the eye's view; true: depths are to be chosen, as it is another one or more is drawn than there is room for. */
+  isDue(view: string, drawn: number, budget: number): boolean {
+    this.view = view;
+    return view !== this.keptView || drawn > budget * SLACK;
+  }
+
+  /** Take note that depths were chosen; `isOfNow`: for the map as it is now. */
+  note(isOfNow: boolean): void {
+    this.keptView = "";
+    this.isOfNow = isOfNow;
+  }
+
+  /** Keep the depths at another moment, if they were chosen for now. */
+  keep(): void {
+    if (this.isOfNow) this.keptView = this.view;
+  }
+
+  /** Let depths be chosen again: cells changed. */
+  release(): void {
+    this.keptView = "";
+  }
+}
+
 /** A depth for each cell; 0: not shown, because not even its coarsest picture has room. */
 export function plan(cells: readonly Candidate[], budget: number): number[] {
   const nearest = cells.map((_, n) => n).sort((a, b) => cells[b].sizePx - cells[a].sizePx || cells[a].distanceM - cells[b].distanceM);
@@ -47,7 +80,7 @@ export function plan(cells: readonly Candidate[], budget: number): number[] {
   let total = 0;
   for (const n of nearest) {
     const more = expected(cells[n], COARSEST);
-    if (total + more > budget) break; // whatever is farther is left out, too
+    if (total + more > budget) break; // all that is farther is left out, too
     depths[n] = COARSEST;
     total += more;
   }

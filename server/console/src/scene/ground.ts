@@ -3,7 +3,7 @@
  *     surfaces by column, of a cell and the cells around it  -->  the nearest in height of each of eight neighbours
  *         -->  plane through them: slope, roughness;  largest step;  obstacle over it  -->  difficulty, as `cairn map query ... elevation` has it
  *
- * Written into the nodes' bytes, which the graphics card draws. Neighbours shown at another depth are unknown. */
+ * It is written into the bytes that a cell draws (`ShownCell.bytes`), not into those that other moments share. Neighbours shown at another depth are unknown. */
 
 import type { InterleavedBufferAttribute } from "three";
 import { COLOURED, DIFFICULTY_STEP, NO_SLOPE, RISE_STEP_M, SLOPE_STEP_DEG, STRIDE } from "../decode/pack.ts";
@@ -19,7 +19,7 @@ const CLEARANCE_M = 1.5;
 const PLANE_MIN = 5;
 /** Surfaces are drawn down to the lowest one around, but not as deep as this, m: below is another surface, or a hole. */
 const FALL_MAX_M = 0.6;
-/** For so long ground is found at a time; the next tick goes on. All that a page without a graphics card shows takes 0.2 s. */
+/** Time of one tick, after which the next one goes on, ms. All that a page without a graphics card shows takes 0.2 s. */
 const WRITE_MS = 30;
 const NEIGHBOURS = Array.from({ length: 27 }, (_, n) => [(n % 3) - 1, (Math.floor(n / 3) % 3) - 1, Math.floor(n / 9) - 1] as const);
 
@@ -27,8 +27,9 @@ const NEIGHBOURS = Array.from({ length: 27 }, (_, n) => [(n % 3) - 1, (Math.floo
 interface Columns {
   readonly first: Int32Array;
   readonly next: Int32Array;
-  /** Height of each row's surface, m in the map; NaN: it is an obstacle. And where each row ends. */
+  /** Height of each row's surface, m in the map; NaN: it is an obstacle. */
   readonly heights: Float64Array;
+  /** Upper end of each row, m in the map. */
   readonly tops: Float64Array;
 }
 
@@ -43,9 +44,11 @@ export interface GroundReading {
 export class Ground {
   /** Something was written: a frame is to be drawn. */
   onChange: () => void = () => {};
+  /** Number of times that something was written so far. */
+  writes = 0;
   private seen = -1;
   private readonly columns = new WeakMap<Uint8Array, Columns>();
-  /** What the ground of each cell was last found from. */
+  /** Bytes of a cell and the cells around it from which its ground was last found. */
   private readonly madeOf = new WeakMap<ShownCell, readonly (Uint8Array | null)[]>();
   private readonly cells: Cells;
 
@@ -53,11 +56,20 @@ export class Ground {
     this.cells = cells;
   }
 
-  /** A few times a second: the ground of all cells that changed, or next to which one did. */
+  /** Find the ground of cells that changed, or next to which one did: a part of them, a few times a second. */
   tick(): void {
+    this.writeUntil(performance.now() + WRITE_MS);
+  }
+
+  /** Find the ground of all of them now. */
+  finish(): void {
+    this.writeUntil(Infinity);
+  }
+
+  /** `endMs`: as of performance.now(). */
+  private writeUntil(endMs: number): void {
     if (!this.cells.isLevel || this.seen === this.cells.shows) return;
     this.seen = this.cells.shows;
-    const endMs = performance.now() + WRITE_MS;
     let isOther = false;
     for (const cell of this.cells.all.values()) {
       if (!cell.points) continue;
@@ -75,10 +87,12 @@ export class Ground {
       this.write(cell, around);
       isOther = true;
     }
-    if (isOther) this.onChange();
+    if (!isOther) return;
+    this.writes++;
+    this.onChange();
   }
 
-  /** What the bytes of a node say. */
+  /** Ground at a node, as its bytes have it. */
   reading({ bytes, box, depth }: ShownCell, row: number): GroundReading {
     const at = row * STRIDE;
     const millimetres = bytes[at + 8]! + 256 * bytes[at + 9]!;
@@ -158,7 +172,7 @@ function surfaceAt(tables: readonly (Columns | null)[], x: number, y: number, si
   return best;
 }
 
-/** Height over a surface of the highest thing over it in its column, within the clearance, m; 0: nothing is. */
+/** Height of the highest thing over a surface in its column, within the clearance, m over that; 0: nothing is. */
 function obstacleOver(tables: readonly (Columns | null)[], x: number, y: number, side: number, heightM: number): number {
   let highest = 0;
   for (let k = 0; k < 3; k++) {
@@ -172,7 +186,7 @@ function obstacleOver(tables: readonly (Columns | null)[], x: number, y: number,
   return highest;
 }
 
-/** The plane through a surface and those around it, by least squares about their means, and the largest step. */
+/** Slope and roughness of the plane through a surface and those around it (least squares about their means), largest step, and fall, m. */
 function around9(
   tables: readonly (Columns | null)[], x: number, y: number, side: number, heightM: number, edgeM: number,
 ): { slopeDeg: number | null; roughnessM: number; stepM: number; fallM: number } {

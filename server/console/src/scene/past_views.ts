@@ -7,7 +7,7 @@ const BYTES_MAX = 96 << 20;
 
 export class PastViews {
   private readonly views = new Map<string, Uint8Array>();
-  /** Of each cell and depth the bytes that came last: what they equal is not kept twice. */
+  /** Bytes of each cell and depth that came last: equal ones are not kept twice. */
   private readonly last = new Map<string, Uint8Array>();
   private readonly shares = new Map<Uint8Array, number>();
   private sizeBytes = 0;
@@ -44,7 +44,7 @@ export class PastViews {
     return kept;
   }
 
-  /** Count one more, or one fewer, who shares bytes. */
+  /** Count one share of some bytes more, or one less. */
   private take(bytes: Uint8Array, by: 1 | -1): void {
     const before = this.shares.get(bytes) ?? 0;
     if (before === 0) this.sizeBytes += bytes.length;

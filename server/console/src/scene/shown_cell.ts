@@ -6,6 +6,7 @@ import type { Triple } from "../messages.ts";
 
 /** failedMs of a cell that never failed. */
 export const NEVER_MS = -1e9;
+const NO_NODES = new Uint8Array(0);
 
 export class ShownCell {
   readonly key: string;
@@ -14,39 +15,43 @@ export class ShownCell {
   digest = "";
   /** Log entry that last changed it. */
   lm = 0;
-  /** Newest entry whose evidence was still in it when `lm` had changed it; null: nobody asked. */
+  /** Newest entry whose evidence was still in it when `lm` had changed it; null: it was not asked for. */
   held: { lm: number; seq: number } | null = null;
   /** Nodes counted by depth; undefined: not yet. */
   counts: (number | undefined)[] = [];
   points: Points | null = null;
-  bytes: Uint8Array = new Uint8Array(0);
+  /** Nodes as they came, which other moments may share, and as they are drawn: of a level a copy, which scene/ground.ts writes into. */
+  source: Uint8Array = NO_NODES;
+  bytes: Uint8Array = NO_NODES;
   /** Depth that is shown, and the one that is to be; 0: nothing. */
   depth = 0;
   wanted = 0;
   etag: string | null = null;
-  /** What is shown is not what the server has. */
+  /** The nodes that are drawn are not those that the server has. */
   dirty = true;
   busy = false;
   failedMs = NEVER_MS;
   /** Moment that is shown; empty: now. */
   momentKey = "";
-  /** What it held at that moment is not known any more. */
+  /** Its state at that moment is not known any more. */
   isUnknown = false;
   /** Until when it pulses, because it changed. */
   freshMs = 0;
   readonly number: number;
   private readonly sizeM: Vector3;
+  private readonly isLevel: boolean;
 
-  constructor(cell: Triple, edgeM: number, heightM: number, number: number) {
+  constructor(cell: Triple, { edgeM, heightM, isLevel }: { edgeM: number; heightM: number; isLevel: boolean }, number: number) {
     this.cell = cell;
     this.key = cell.join(",");
     this.sizeM = new Vector3(edgeM, edgeM, heightM);
+    this.isLevel = isLevel;
     this.number = number;
     const low = new Vector3(...cell).multiply(this.sizeM);
     this.box = new Box3(low, low.clone().add(this.sizeM));
   }
 
-  /** Whose evidence is the newest in it, as far as that is known. */
+  /** Log entry of the newest evidence in it, as far as that is known. */
   get heldLm(): number {
     return this.held?.lm === this.lm ? this.held.seq : this.lm;
   }
@@ -55,17 +60,17 @@ export class ShownCell {
     return this.bytes.length / STRIDE;
   }
 
-  /** Nothing in it is occupied, at whatever depth. */
+  /** No node in it is occupied, at whatever depth. */
   get isEmpty(): boolean {
     return this.etag !== null && this.count === 0 && this.counts.includes(0);
   }
 
-  /** What is shown is coarser or finer than wanted. */
+  /** It is drawn coarser or finer than wanted. */
   get isOff(): boolean {
     return this.depth !== this.wanted && !this.isEmpty && !this.isUnknown;
   }
 
-  /** What is shown is all that its depth has; where that changed, other depths are guessed to have changed alike. */
+  /** Take the number of nodes that are drawn as that of a depth; where it changed, other depths are guessed to have changed alike. */
   counted(depth: number): void {
     const before = this.counts[depth];
     if (before === 0 || (before && !this.count)) this.counts = [];
@@ -74,11 +79,13 @@ export class ShownCell {
   }
 
   /** Take other nodes; their points, which the caller adds to the picture, or null if there are none. */
-  take(bytes: Uint8Array, depth: number, material: ShaderMaterial): Points | null {
+  take(source: Uint8Array, depth: number, material: ShaderMaterial): Points | null {
     this.drop();
-    this.bytes = bytes;
+    this.source = source;
     this.depth = depth;
-    if (!bytes.length) return null;
+    if (!source.length) return null;
+    const bytes = this.isLevel ? source.slice() : source;
+    this.bytes = bytes;
     const side = 2 ** depth;
     const geometry = geometryOf(bytes);
     geometry.boundingSphere = new Sphere(new Vector3(side / 2, side / 2, side / 2), side);
@@ -97,7 +104,7 @@ export class ShownCell {
     this.points?.removeFromParent();
     this.points?.geometry.dispose();
     this.points = null;
-    this.bytes = new Uint8Array(0);
+    this.source = this.bytes = NO_NODES;
     this.depth = 0;
   }
 }

@@ -8,12 +8,12 @@ import { EyeDome } from "./eye_dome.ts";
 import { uniforms } from "./materials.ts";
 
 const FLIGHT_MS = 450;
-/** Of a drawing without a graphics card, whose frame takes 50 ms and more of all cores: cells come sooner without it. */
+/** Time between frames for cells that come, without a graphics card, ms: a frame takes 50 ms and more of all cores, and cells come sooner without it. */
 const SOON_MS = 1000;
-/** After its last move the eye rests, ms. */
+/** Time from the eye's last move to its rest, ms. */
 const REST_MS = 200;
 const STEP_RAD = Math.PI / 30;
-/** Of the picture, by what is looked at. */
+/** Part of the picture that is filled by what is looked at. */
 const FILLED = 0.92;
 
 /** Whether this browser draws in three dimensions at all. */
@@ -43,7 +43,7 @@ export class Stage {
   private asked = false;
   private later = 0;
   private atRest = 0;
-  /** Until when the eye counts as moving, as of performance.now(). */
+  /** Time up to which the eye counts as moving, as of performance.now(). */
   private restsMs = 0;
   private ready = false;
   private flight: { from: CameraView; to: CameraView; startMs: number } | null = null;
@@ -85,7 +85,7 @@ export class Stage {
     this.overlays.add(...objects);
   }
 
-  /** Have the shaders of what will be drawn compiled beside the page's own work; then draw. */
+  /** Have the shaders of what will be drawn compiled next to the page's own work; then draw. */
   async prepare(): Promise<void> {
     await this.dome.compile(this.renderer, this.voxels, this.camera);
     this.ready = true;
@@ -157,7 +157,7 @@ export class Stage {
     this.flyOn(to);
   }
 
-  /** Bring it on from there: no flight of its own for those who go back. */
+  /** Bring the eye somewhere as a part of the flight before: `onFly` does not hear of it, so Back undoes both at once. */
   flyOn(to: CameraView): void {
     if (matchMedia("(prefers-reduced-motion: reduce)").matches || this.isSoftware) return this.place(to);
     this.flight = { from: this.view, to, startMs: performance.now() };

@@ -1,4 +1,4 @@
-/** What the colours mean: of the field that is shown, and of no other; its ends can be locked. */
+/** Legend of the field that is shown: the meaning of its colours, and ends that can be locked. */
 
 import { classColours, unsureColour } from "../class_colours.ts";
 import { fill, h } from "../dom.ts";
@@ -14,13 +14,14 @@ export interface Names {
   readonly classes: readonly string[];
 }
 
-/** What the log tells: the unit of ages, how much of the range's own it is, and how far back the log is known. */
+/** Facts from the log for the legend: the unit of ages, and how far back the log is known. */
 export interface Told {
   readonly unit: string;
+  /** The unit, in the range's own, s or log entries. */
   readonly size: number;
-  /** To all that is shown; not yet; or not so far. */
+  /** Reach of the known log: to all that is shown, not yet so far, or no farther. */
   readonly log: "whole" | "read" | "short";
-  /** Of all that is known, s; null: no entry states a time. */
+  /** Time of the newest measurement that is known, s; null: no entry states a time. */
   readonly newestS: number | null;
   /** Edge of the cells, by which ages and robots are known, m. */
   readonly cellM: number;
@@ -35,7 +36,7 @@ export interface Values {
 const READING = "older entries of the log are being read";
 const FAR = `before the newest ${thousands(KEPT)} entries of the log`;
 const RAMP = { width: 240, height: 12 };
-/** Of the ramp, at each end that is open. */
+/** Length of the block at each end of the ramp that is open, px. */
 const BLOCK_PX = 12;
 const BARS = 48;
 const BARS_PX = 22;
@@ -124,14 +125,14 @@ function titleOf(field: Field, told: Told, { shift }: Values): string {
   return `${label}${unit ? `, ${unit}` : ""}`;
 }
 
-/** Whether something of the map lies below the lower end, and above the upper one. */
+/** Ends of the range beyond which the map has values: below the lower one, and above the upper one. */
 function openEnds(field: Field, [low, high]: [number, number], { histogram }: Values): [boolean, boolean] {
   if (field === "age") return [false, false];
   if (isOfGround(field)) return [false, true];
   return histogram ? [histogram.least < low, histogram.most > high] : [false, false];
 }
 
-/** What the end blocks stand for, in words. */
+/** Meaning of the end blocks, in words. */
 function beyond(field: Field, range: [number, number], values: Values): HTMLElement[] {
   const { shift, histogram } = values;
   const line = (colour: string, text: string) => h("p", { class: "bare" }, block(colour), text);
@@ -187,7 +188,7 @@ function named(name: string, robots: readonly string[]): HTMLElement {
   return h("p", {}, dot, ` ${name}`);
 }
 
-/** Where the palette begins and ends on the bar, px: between the blocks of ends that are open. */
+/** Begin and end of the palette on the bar, px: between the blocks of ends that are open. */
 function innerPx(isBelow: boolean, isAbove: boolean): [number, number] {
   return [isBelow ? BLOCK_PX : 0, RAMP.width - (isAbove ? BLOCK_PX : 0)];
 }
@@ -210,7 +211,7 @@ function bar(stops: string[], [isBelow, isAbove]: [boolean, boolean], reversed: 
   return canvas;
 }
 
-/** How many voxels have which value: roots, so that the few hot ones are seen, too. */
+/** Histogram of the voxels' values: roots of counts, so that the few hot ones are seen, too. */
 function bars({ begin, step, counts }: { begin: number; step: number; counts: readonly number[] }, [low, high]: [number, number], open: [boolean, boolean]): HTMLCanvasElement {
   const canvas = h("canvas", { width: RAMP.width, height: BARS_PX, class: "bars", "aria-hidden": "true" });
   const context = canvas.getContext("2d")!;

@@ -13,7 +13,7 @@ import type { Stage } from "../scene/stage.ts";
 import { metres } from "../units.ts";
 
 const PINK = 0xff3d7f;
-/** Of the profile's picture, px. */
+/** Size of a profile's picture, px. */
 const PROFILE = { width: 244, height: 80 };
 
 export class MeasurePanel {
@@ -31,7 +31,7 @@ export class MeasurePanel {
   /** Words at the lines, in the picture. */
   readonly words = h("div", { class: "lengths", "aria-hidden": "true" });
   private written: { word: HTMLElement; at: Vector3 }[] = [];
-  /** What profile and volume were made of. */
+  /** State of the picture of which profile and volume were made. */
   private madeOf = "";
   private readonly cells: Cells;
   private readonly look: Look;
@@ -55,18 +55,18 @@ export class MeasurePanel {
     this.show();
   }
 
-  /** A few times a second: what is shown may have become finer, or is of another moment. */
+  /** Measure again where what is shown has become finer, or is of another moment; a few times a second. */
   tick(): void {
     if (this.points.length > 1 && !this.cells.waiting && !this.cells.needsPlan && this.madeOf !== this.shown) this.show();
   }
 
-  /** What of the map is shown, in short. */
+  /** State of the picture, as a key. */
   private get shown(): string {
     const { uLow, uHigh, uMinP } = uniforms;
     return JSON.stringify([this.cells.drawn, this.cells.head, this.look.atS, uLow.value, uHigh.value, uMinP.value]);
   }
 
-  /** Whether clicks set points, rather than ask of voxels. */
+  /** Clicks set points, rather than ask of voxels. */
   get isOn(): boolean {
     return this.toggle.getAttribute("aria-pressed") === "true";
   }
@@ -77,7 +77,7 @@ export class MeasurePanel {
     this.onSwitch(this.isOn);
   }
 
-  /** Beyond as many as an address holds, points are not taken. */
+  /** Add a point, unless there are as many as an address holds. */
   add(point: Vector3): void {
     if (this.points.length < POINTS_MAX) this.points.push(point.clone());
     this.show();
@@ -168,7 +168,7 @@ function profilePicture({ stepM, tops }: Profile): HTMLElement {
   );
 }
 
-/** Of the polygon with these corners, m²: half the length of its vector area (Newell), so of its flattest picture. */
+/** Area of the polygon with these corners, m²: half the length of its vector area (Newell), so of its flattest picture. */
 export function areaOf(corners: readonly Vector3[]): number {
   const sum = new Vector3();
   corners.forEach((corner, n) => {

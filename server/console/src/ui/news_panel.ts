@@ -1,4 +1,4 @@
-/** What happened since the page was opened: a few lines, each of which leads to its place. */
+/** News since the page was opened: a few lines, each of which leads to its place. */
 
 import { fill, h } from "../dom.ts";
 import type { NewsItem } from "../news.ts";

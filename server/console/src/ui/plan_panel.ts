@@ -6,6 +6,7 @@ import type { Heights } from "../heights.ts";
 import type { Triple } from "../messages.ts";
 import type { Cells } from "../scene/cells.ts";
 import { floorPlanOf, slabOf, storeyAt, type FloorPlan } from "../scene/floor_plan.ts";
+import type { Ground } from "../scene/ground.ts";
 import { uniforms } from "../scene/materials.ts";
 import type { Stage } from "../scene/stage.ts";
 import { storeyName } from "./look_panel.ts";
@@ -19,7 +20,7 @@ const PAPER_RATIO = 1.4;
 
 const NOTHING = "Nothing of this storey is in the map.";
 
-/** What the plan shows of the rest of the page, and does to it. */
+/** Parts of the page that the plan shows, and its effects on the page. */
 export interface PlanSource {
   ink(): PlanInk;
   findings(): readonly Finding[];
@@ -45,12 +46,14 @@ export class PlanPanel {
   private readonly storeys = h("div", { class: "buttons", role: "group", "aria-label": "Storey of the plan" });
   private readonly stage: Stage;
   private readonly cells: Cells;
+  private readonly ground: Ground;
   private readonly heights: Heights;
   private readonly source: PlanSource;
 
-  constructor(stage: Stage, cells: Cells, heights: Heights, source: PlanSource) {
+  constructor({ stage, cells, ground }: { stage: Stage; cells: Cells; ground: Ground }, heights: Heights, source: PlanSource) {
     this.stage = stage;
     this.cells = cells;
+    this.ground = ground;
     this.heights = heights;
     this.source = source;
     this.small = h("button", { type: "button", class: "corner", title: "Plan of this storey (P)", "aria-label": "Small plan: open it", hidden: true, onclick: () => this.switch() }, this.corner);
@@ -78,7 +81,7 @@ export class PlanPanel {
     if (!this.isOpen && this.plan && !this.small.checkVisibility()) return; // narrow pages have no room for it
     const { floorsM } = this.heights.storeys;
     if (!this.isChosen) this.storey = storeyAt(floorsM, this.stage.view.target[2]);
-    const madeOf = JSON.stringify([this.cells.head, this.cells.momentKey, this.cells.drawn, uniforms.uMinP.value, floorsM, this.storey]);
+    const madeOf = JSON.stringify([this.cells.head, this.cells.momentKey, this.cells.drawn, this.ground.writes, uniforms.uMinP.value, floorsM, this.storey]);
     // A raster of all that is there takes the time of a frame or more: while a large map comes, none is made.
     const isComing = this.cells.isFetching || this.cells.waiting > 0 || this.cells.needsPlan;
     if (madeOf !== this.madeOf && performance.now() >= this.nextMs && !(isComing && !this.isOpen) && this.cells.firstPictureMs !== null) {
@@ -101,6 +104,7 @@ export class PlanPanel {
   /** Plans of all storeys for a report, from the lowest: drawn for paper. */
   pictures(width: number, height: number): { name: string; canvas: HTMLCanvasElement; said: string }[] {
     const { floorsM } = this.heights.storeys;
+    this.ground.finish();
     return (floorsM.length ? floorsM : [0]).flatMap((floorM, storey) => {
       const plan = floorPlanOf(this.cells, floorsM, storey);
       if (!plan) return [];
@@ -134,7 +138,7 @@ export class PlanPanel {
     this.tick();
   }
 
-  /** What lies in a storey's slab, and in the space above it up to the next floor. */
+  /** Findings and robots in a storey's slab, and in the space above it up to the next floor. */
   private marks(storey: number): PlanMarks {
     const { floorsM } = this.heights.storeys;
     const isHere = (place: Triple) => floorsM.length < 2 || storeyAt(floorsM, place[2]) === storey;

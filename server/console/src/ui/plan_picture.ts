@@ -27,7 +27,7 @@ export interface PlanMarks {
   readonly view: CameraView | null;
 }
 
-/** Where a plan lies in a picture: px of a column, and of its upper left corner. */
+/** Place of a plan in a picture: px of a column, and of its upper left corner. */
 export interface Fit {
   readonly scale: number;
   readonly left: number;
@@ -49,9 +49,9 @@ const GROUNDS: Record<"dark" | "light", { fog: Rgb; stripe: Rgb; gap: Rgb; gapSt
 const INFERNO = textureOf("inferno") as DataTexture;
 const VIRIDIS = textureOf("viridis") as DataTexture;
 const BEYOND = rgbOf(OVER).map((part) => Math.round(255 * part)) as unknown as Rgb;
-/** Of a level: byte of a node's colour in which a field is, and its step. */
+/** Byte of a node's colour that has a field of a level, and its unit. */
 const CODED = { difficulty: { byte: 0, step: DIFFICULTY_STEP }, slope: { byte: 1, step: SLOPE_STEP_DEG }, step: { byte: 2, step: RISE_STEP_M } };
-/** Of a plan in its place, and the least of the scale bar, px. */
+/** Part of its place that a plan fills, and the least length of the scale bar, px. */
 const FILLED = 0.94;
 const BAR_PX = 90;
 /** A finding without another one so near has its temperature next to it, px. */
@@ -149,7 +149,7 @@ function shaded(palette: DataTexture, value: number, [low, high]: [number, numbe
   return [data[at], data[at + 1], data[at + 2]];
 }
 
-/** Where one looks from, and the way. */
+/** The eye: its place, and the direction in which it looks. */
 function drawEye(context: CanvasRenderingContext2D, plan: FloorPlan, fit: Fit, { eye, target }: CameraView, ink: string, ratio: number): void {
   const [x, y] = pixelOf(plan, fit, eye);
   const way = Math.atan2(-(target[1] - eye[1]), target[0] - eye[0]);

@@ -5,12 +5,12 @@ import { fill, h, pictureOf } from "../dom.ts";
 import type { Field } from "../look.ts";
 import type { Pose } from "../messages.ts";
 
-/** Of two pictures, ms: a robot tells its pose several times a second, and the server draws for others, too. */
+/** Time from one picture to the next, ms: a robot reports its pose several times a second, and the server draws for others, too. */
 const PAUSE_MS = 1500;
 /** After a picture that could not be made: the server may have been busy. */
 const AGAIN_MS = 5000;
 const WAIT_MS = 20_000;
-/** Levels have fields that the server draws no pictures of, and no pictures at all. */
+/** Layer of the server's pictures for each field; fields of a level's ground have none. */
 const LAYERS: Partial<Record<Field, string>> = {
   colour: "colour", temperature: "temperature", probability: "probability", height: "depth", age: "age", robot: "colour",
 };
@@ -20,22 +20,25 @@ export class RobotMap {
   readonly element = h("figure", { class: "seen", hidden: true });
   private readonly api: Api;
   private readonly map: string;
+  private readonly isLevel: boolean;
   private robot: string | null = null;
-  /** What was asked for last. */
+  /** Picture that was asked for last. */
   private asked = "";
   private busy = false;
   private nextMs = 0;
 
-  constructor(api: Api, map: string) {
+  /** `isLevel`: the map is one, of which the server draws no pictures. */
+  constructor(api: Api, map: string, isLevel: boolean) {
     this.api = api;
     this.map = map;
+    this.isLevel = isLevel;
   }
 
-  /** From a robot's pose, in the colours of a field, of the map at log entry `head`; null: nobody is followed. */
+  /** Show the map at log entry `head` from a robot's pose, in the colours of a field; null: no robot is followed. */
   show(robot: string | null, pose: Pose | null, field: Field, head: number): void {
     if (robot !== this.robot || pose === null) this.clear();
     this.robot = robot;
-    const layer = LAYERS[field];
+    const layer = this.isLevel ? undefined : LAYERS[field];
     if (robot === null || pose === null || layer === undefined) return;
     const [x, y, z] = pose.t_map_rig;
     const [qx, qy, qz, qw] = pose.q_map_rig;

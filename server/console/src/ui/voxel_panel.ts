@@ -1,8 +1,9 @@
-/** What was clicked: first what the picture knows, then the server's own numbers. */
+/** Facts about the voxel that was clicked: first those of the picture, then the server's own numbers. */
 
 import type { Api } from "../api.ts";
 import { classColours, classOf } from "../class_colours.ts";
 import { facts, fill, h } from "../dom.ts";
+import { robotOf } from "../log_book.ts";
 import type { Look } from "../look.ts";
 import { classesOf } from "../map_layers.ts";
 import type { Channel, MapInfo, Triple } from "../messages.ts";
@@ -163,7 +164,7 @@ function exact(answer: VoxelAnswer): HTMLElement {
 function whence(answer: VoxelAnswer, last: string | null): HTMLElement {
   const rows = answer.commits.map(({ id, hits, misses, captured_s }) => {
     const when = captured_s ? `${clock(captured_s[1])} (${ago(serverNowS() - captured_s[1])})` : "at an unknown time";
-    return h("li", {}, h("strong", {}, id.split(".")[0]), ` ${counted(hits, "hit", "hits")}, ${counted(misses, "miss", "misses")}; ${when}`, h("code", {}, id));
+    return h("li", {}, h("strong", {}, robotOf(id)), ` ${counted(hits, "hit", "hits")}, ${counted(misses, "miss", "misses")}; ${when}`, h("code", {}, id));
   });
   const left = [
     `Log entry ${answer.lm}${last ? ` of ${last}` : ""} changed this cell last.`,
