@@ -173,7 +173,7 @@ class Service:
                 on_fold=self._folded,
                 may_forget_s=upstream.may_forget_s,
                 process=fold_process,
-                memory=FoldMemory.of_server(settings.memory, settings.folder),
+                memory=FoldMemory.of_server(settings.memory, settings.folder, is_all=settings.folding == "only"),
             )
         self.readiness = Readiness(store.health, folds, settings, self._is_folding, warming)
         self.cells = Cells(store, damaged, on_heal=self._wake_folding)

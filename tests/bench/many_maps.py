@@ -1,8 +1,9 @@
 """Many maps: eight folded by two processes next to one by one, and a thousand in use beside ten thousand idle ones.
 
 Commits lie in the store before anybody folds, so that folding alone is measured, from a tenth of them on: the first
-ones load kernels. Of the thousand maps each commit's lag is the time from its receipt, by the database's clock, until
-it does not wait any more, seen every tenth of a second.
+ones load kernels. Robots of the thousand maps have pushed before they are measured: the first push of each writes more
+rows, and a team pushes for hours. Of these maps each commit's lag is the time from its receipt, by the database's
+clock, until it does not wait any more, seen every tenth of a second.
 """
 
 import http.client
@@ -26,7 +27,6 @@ from tests.replicas.fault_run import postgres_in
 
 from cairn_map.evidence.grid import Geometry, geometry_for
 from cairn_map.evidence.inverse_sensor_model import SensorModel
-from cairn_map.wire.messages import CreateMap
 from cairn_server.store.postgres.schema import IS_WAITING
 from cairn_server.store.postgres.store import PgStore
 from cairn_server.store.sqlite.store import SqliteStore
@@ -135,14 +135,21 @@ def _crowd_rows(diffs: list[Diff], geometry: Geometry, maps: int, idle: int, sec
     with postgres_in(programs_of("wheel")) as postgres, tempfile.TemporaryDirectory() as name:
         postgres.execute("CREATE DATABASE cairn")
         url, members = postgres.url("cairn"), []
+        store = PgStore(url)
+        rows = [store.create_map(f"map{n}", geometry, SensorModel())[0] for n in range(maps)]
+        for n in range(robots):
+            store.append(rows[n % maps], bodies.commit(f"robot{n // maps}", 0))
+        store.close()
         with ExitStack() as stack:
             for n, role in enumerate(("--no-fold", "--no-fold", "--fold-only")):
                 server = Server(Path(name) / str(n), geometry, "--store", url, role)
                 members.append(stack.enter_context(closing(server)))
-            tokens = _registered(members[:2], geometry, maps)
+            tokens = _registered(members[:2], maps)
             with psycopg.connect(url, autocommit=True) as link:
                 link.execute(IDLE, [idle])
-            commits = ((*tokens[n % robots], n // robots) for n in itertools.count())
+                while _number(link, "SELECT sum(folded) FROM head") < robots:
+                    time.sleep(LOOK_S)
+            commits = ((*tokens[n % robots], 1 + n // robots) for n in itertools.count())
             _push_all(members[:2], bodies, commits, robots, WARM_S, _Load())  # the first ones load kernels
             with psycopg.connect(url, autocommit=True) as link:
                 link.execute("ANALYZE")  # as the database does by itself each minute
@@ -176,12 +183,9 @@ def _p99(times_s: Sequence[float]) -> float:
     return sorted(times_s)[int(0.99 * (len(times_s) - 1))]
 
 
-def _registered(servers: Sequence[Server], geometry: Geometry, maps: int) -> list[tuple[str, str, str]]:
-    """Maps with robots: for each robot its map, name and token; the robots of a map are far from each other."""
+def _registered(servers: Sequence[Server], maps: int) -> list[tuple[str, str, str]]:
+    """For each robot its map, name and token; the robots of a map are far from each other."""
     links = [http.client.HTTPConnection("127.0.0.1", server.port, timeout=60) for server in servers]
-    made = CreateMap(geometry=geometry).model_dump_json().encode()
-    for n in range(maps):
-        _asked(links[n % len(links)], "PUT", f"/maps/map{n}", made, {"Content-Type": "application/json"})
     found = []
     for n, robot in itertools.product(range(ROBOTS_EACH), range(maps)):
         body = json.dumps({"robot": f"robot{n}", "incarnation": "0" * 16}).encode()

@@ -114,6 +114,11 @@ class MemoryStore:
         with self._maps.locked() as maps:
             return [maps[name].row for name in sorted(maps) if any(kept.is_due for kept in maps[name].commits.values())]
 
+    def next_waiting(self, *, after: int, limit: int) -> list[MapRow]:
+        """The first of these maps whose numbers are above one, by number."""
+        rows = sorted(self.waiting_maps(), key=lambda row: row.number)
+        return [row for row in rows if row.number > after][:limit]
+
     def maps_with_evidence(self, *, before_s: float) -> list[MapRow]:
         """Maps with evidence of commits folded before an age of the store, by name."""
         with self._maps.locked() as maps:

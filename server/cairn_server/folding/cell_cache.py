@@ -51,9 +51,21 @@ class Changed(NamedTuple):
 class CellCache:
     """Most recently changed cells of one map, in the state of one cursor; not thread-safe."""
 
-    def __init__(self, geometry: Geometry, memory: FoldMemory | None = None, *, limit_bytes: int | None = None) -> None:
-        """A cache of a map, which keeps as much as there is memory for cells, or less."""
+    def __init__(
+        self,
+        geometry: Geometry,
+        memory: FoldMemory | None = None,
+        *,
+        limit_bytes: int | None = None,
+        more: Callable[[], int] = int,
+    ) -> None:
+        """A cache of a map, which keeps as much as there is memory for cells, or less.
+
+        `more` is asked when that is full: bytes that it may have from now on, for which another map's cells were
+        dropped; 0: none.
+        """
         self._memory = memory or FoldMemory()
+        self._more = more
         self._limit_bytes = self._memory.cells_bytes if limit_bytes is None else limit_bytes
         self.size_bytes = 0
         self._geometry = geometry
@@ -165,6 +177,9 @@ class CellCache:
     def trim(self) -> None:
         """Drop the cells changed longest ago until the bound holds, all but the newest cell if need be."""
         while self.size_bytes > self._limit_bytes and len(self._cells) > 1:
+            if more_bytes := self._more():
+                self._limit_bytes += more_bytes
+                continue
             # The first one was changed longest ago; what is not written yet stays as a draft of its row.
             key = next(iter(self._cells))
             if key in self._changed:

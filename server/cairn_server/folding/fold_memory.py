@@ -42,7 +42,11 @@ class FoldMemory:
         return spool
 
     @classmethod
-    def of_server(cls, shares: MemoryShares, folder: Path) -> Self:
-        """Memory for folding in a server's processes; the store is in this folder."""
+    def of_server(cls, shares: MemoryShares, folder: Path, *, is_all: bool = False) -> Self:
+        """Memory for folding in a server's processes; the store is in this folder.
+
+        In a server that does nothing else (`is_all`) cells under change have that of checks, bodies and caches, too.
+        """
         room = folding_room(shares.folding_bytes - SPOOLS_BYTES)
-        return cls(int(shares.cache_share * CACHE_BYTES), room, folder=folder)
+        unused_bytes = shares.check_workers * shares.check_bytes + shares.bodies_bytes + shares.caches_bytes
+        return cls(unused_bytes if is_all else int(shares.cache_share * CACHE_BYTES), room, folder=folder)

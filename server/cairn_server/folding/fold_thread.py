@@ -14,7 +14,7 @@ from cairn_server.folding.fold_process import FoldProcess, LostProcessError
 from cairn_server.folding.fold_turns import GROUP_S
 from cairn_server.folding.group_folding import GROUP_MAX, Folded, LocalFolding
 from cairn_server.folding.readiness import FoldHealth
-from cairn_server.store.store import Store
+from cairn_server.store.store import FoldLeases, Store
 from cairn_server.store.store_rows import MapRow
 from cairn_server.upkeep import Upkeep
 
@@ -30,7 +30,7 @@ REST_LOOK_S = 0.05
 """Time between two looks for commits to other maps while those with commits rest."""
 POLL_S = 0.2
 """Time between two looks for commits that came by another server of the same store."""
-CLAIM_MAX = 4
+CLAIM_MAX = 16
 """Maps that are claimed at a time, so that processes that fold together share them by how fast they are."""
 LOOK_S = 0.02
 """Time between two looks at a plan in the background."""
@@ -80,6 +80,8 @@ class FoldThread:
         self._local = LocalFolding(store, damaged, memory)
         self._holder = secrets.token_hex(8)
         self._rests = _Rests()
+        self._claimed_to = -1
+        """Number of the map up to which this process has claimed maps in the round under way: each has its turn."""
         self._wake.set()
         self._thread = threading.Thread(target=self._run, name="cairn-fold", daemon=True)
         self._thread.start()
@@ -122,13 +124,13 @@ class FoldThread:
     def _fold_all(self) -> bool:
         """Fold until nothing is pending, one group of each map in turn; False if a map failed."""
         failed: set[str] = set()
-        maps: list[MapRow] = []
+        planned: list[MapRow] = []  # the one of which commits are planned in the background
         rests = self._rests
-        busy, planning = True, False
-        while (busy or planning or rests) and not self._closing.is_set():
+        busy = True
+        while (busy or planned or rests) and not self._closing.is_set():
             # A plan in the background does not report its end. Nor is a map that rests a reason to let others wait.
             if not busy:
-                (self._wake if planning else self._closing).wait(LOOK_S if planning else rests.left_s())
+                (self._wake if planned else self._closing).wait(LOOK_S if planned else rests.left_s())
             # Cleared before the look, so that a commit that comes during it wakes the thread again; and only if it was
             # set: a commit that comes when the wait has just ended would wait for the plan otherwise.
             is_woken = self._wake.is_set()
@@ -139,11 +141,10 @@ class FoldThread:
             self._watch_clocks(time.monotonic())
             self.upkeep.work()  # here, too: while robots push all the time, this loop has no end
             try:
-                maps = self._maps_at_work(maps if planning else [])
+                maps = self._maps_at_work(planned)
             except Exception:
                 log.exception("cannot list the maps")
                 return False
-            planning = False
             # One group of each map in turn: a busy map does not hold up the others.
             for row in rests.awake(maps):
                 if row.name in failed or self._closing.is_set():
@@ -152,7 +153,8 @@ class FoldThread:
                 try:
                     folded = self._fold_group(row, is_news=is_news)
                     busy |= folded.commits > 0
-                    planning |= folded.is_planning
+                    if not (folded.is_planning and planned):
+                        planned = [row] if folded.is_planning else []
                 except NotFoundError as exc:
                     log.info("map %s is not folded any more: %s", row.name, exc.message)
                     continue
@@ -179,12 +181,30 @@ class FoldThread:
 
     def _maps_at_work(self, planned: list[MapRow]) -> list[MapRow]:
         """Maps with commits to be folded, and those of which some are planned in the background."""
-        waiting = self._store.waiting_maps()
-        if self._store.leases is not None:
-            waiting = self._store.leases.claim(waiting, holder=self._holder, new_max=CLAIM_MAX)
+        is_alone = self._store.leases is None
+        waiting = self._store.waiting_maps() if is_alone or self._health.has_failures() else []
         self._health.waiting(row.name for row in waiting)
+        if self._store.leases is not None:
+            waiting = self._claimed(self._store.leases)
         known = {row.number for row in waiting}
         return waiting + [row for row in planned if row.number not in known]
+
+    def _claimed(self, leases: FoldLeases) -> list[MapRow]:
+        """Up to some `CLAIM_MAX` maps that wait, do not rest and are no other process's, from the last ones on.
+
+        Where more wait than are folded, what a look costs does not grow with them.
+        """
+        found: dict[int, MapRow] = {}
+        start, is_round = self._claimed_to, self._claimed_to < 0
+        while len(found) < CLAIM_MAX:
+            seen = self._store.next_waiting(after=self._claimed_to, limit=CLAIM_MAX)
+            mine = leases.claim(self._rests.awake(seen), holder=self._holder, new_max=CLAIM_MAX)
+            found |= {row.number: row for row in mine}
+            self._claimed_to = seen[-1].number if len(seen) == CLAIM_MAX else -1
+            if is_round and (self._claimed_to < 0 or self._claimed_to >= start >= 0):
+                break
+            is_round |= self._claimed_to < 0
+        return list(found.values())
 
     def _watch_clocks(self, now_s: float) -> None:
         """Keep the store's age, and report a jump of the wall clock, at most once in `CLOCKS_EVERY_S`."""

@@ -12,6 +12,7 @@ import time
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 from cairn_map.commits.ids import RobotName
 from cairn_map.errors import CairnError
@@ -284,14 +285,27 @@ class LocalFolding:
     def _cache_of(self, row: MapRow) -> CellCache:
         """Cells of a map that stay decoded from one group to the next: a robot's next scans touch the same ones.
 
-        All maps share one memory. At least half of it is for the map that is folded now; those that were folded longest
-        ago give theirs up.
+        All maps share one memory. Those that were folded longest ago give theirs up when the map that is folded now
+        needs it, until that has half of all.
         """
-        bound = int((1 - PLAN_SHARE) * self._memory.cells_bytes)
-        cache = self._caches.pop(row.name, None) or CellCache(row.geometry, self._memory)
-        others = sum(other.size_bytes for other in self._caches.values())
-        while others > bound // 2:
-            others -= self._caches.pop(next(iter(self._caches))).size_bytes
+        cache = self._caches.pop(row.name, None) or CellCache(
+            row.geometry, self._memory, more=partial(self._given_up, row.name)
+        )
         self._caches[row.name] = cache
-        cache.limit(bound - others)
+        others = sum(other.size_bytes for other in self._caches.values()) - cache.size_bytes
+        cache.limit(self._bound_bytes - others)
         return cache
+
+    @property
+    def _bound_bytes(self) -> int:
+        """Memory of all maps' cells between two groups."""
+        return int((1 - PLAN_SHARE) * self._memory.cells_bytes)
+
+    def _given_up(self, name: str) -> int:
+        """Bytes of the map's cells that were dropped for the map of this name; 0: it has half of all memory."""
+        others = {other: cache.size_bytes for other, cache in self._caches.items() if other != name}
+        if sum(others.values()) <= self._bound_bytes // 2:
+            return 0
+        oldest = next(other for other, size_bytes in others.items() if size_bytes)
+        del self._caches[oldest]
+        return others[oldest]

@@ -43,6 +43,11 @@ class FoldHealth:
             self._figures.fold_seconds.labels(name).observe(seconds)
             self._figures.folded.labels(name).inc(commits)
 
+    def has_failures(self) -> bool:
+        """True if the last fold of any map failed."""
+        with self._lock:
+            return bool(self._failing)
+
     def waiting(self, names: Iterable[str]) -> None:
         """Note which maps have commits to be folded: folding of the others does not fail."""
         known = set(names)

@@ -462,6 +462,10 @@ class Store(Protocol):
         """Maps with commits to be folded, or with a retract under way, by name; an idle map costs nothing."""
         ...
 
+    def next_waiting(self, *, after: int, limit: int) -> list[MapRow]:
+        """The first `limit` of these maps whose numbers are above one, by number; others cost nothing, either."""
+        ...
+
     def maps_with_evidence(self, *, before_s: float) -> list[MapRow]:
         """Maps with evidence of commits folded before an age of the store, by name; in one query."""
         ...

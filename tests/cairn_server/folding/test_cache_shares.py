@@ -7,7 +7,7 @@ import pytest
 from tests.fixtures.server.live import Live, Process
 
 from cairn_server.folding import fold_memory, read_cache
-from cairn_server.memory_shares import CACHES_BYTES, CACHES_MIN_BYTES, LIMIT_MIN_BYTES, memory_shares
+from cairn_server.memory_shares import CACHES_BYTES, CACHES_MIN_BYTES, LIMIT_MIN_BYTES, PROGRAMS_BYTES, memory_shares
 from cairn_server.views import hot_spot_search, map_views
 
 
@@ -28,6 +28,13 @@ def test_each_cache_has_its_share(tmp_path: Path) -> None:
         assert caches.changes._limit_bytes == int(share * read_cache.CHANGES_BYTES)
         assert service.views.pictures._read_cells._limit_bytes == int(share * map_views.CELLS_BYTES)
         assert service.views.hot_spots._pieces._limit_bytes == int(share * hot_spot_search.PIECES_BYTES)
+
+
+def test_a_server_that_only_folds_keeps_cells_where_others_have_checks_bodies_and_caches(tmp_path: Path) -> None:
+    shares = memory_shares()
+    memory = fold_memory.FoldMemory.of_server(shares, tmp_path, is_all=True)
+    rest_bytes = PROGRAMS_BYTES + shares.decoding_bytes + shares.folding_bytes
+    assert memory.cells_bytes + rest_bytes == shares.sum_bytes <= shares.limit_bytes
 
 
 @pytest.mark.processes

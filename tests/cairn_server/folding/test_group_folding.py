@@ -21,7 +21,7 @@ from cairn_server.folding import group_folding as module
 from cairn_server.folding.cell_cache import CellCache
 from cairn_server.folding.damaged_cells import DamagedCells
 from cairn_server.folding.fold_memory import FoldMemory
-from cairn_server.folding.group_folding import LocalFolding, Waiting, fold_around
+from cairn_server.folding.group_folding import PLAN_SHARE, LocalFolding, Waiting, fold_around
 from cairn_server.store.history import head_of
 from cairn_server.store.store_rows import MapRow
 
@@ -233,4 +233,24 @@ def test_maps_that_are_folded_in_turn_share_one_memory_and_keep_their_cells_in_i
         assert sum(cache.size_bytes for cache in folding._caches.values()) <= folding._memory.cells_bytes
     for row in rows:
         assert read(bodies(store, row)) == sum_of([pushed(n, n) for n in range(4)])
+    folding.close()
+
+
+def test_maps_give_up_no_cells_that_there_is_memory_for() -> None:
+    """Of four maps that fill the memory together none is decoded again for each commit."""
+    store = MemoryStore()
+    folding = LocalFolding(store, DamagedCells())
+    rows = [store.create_map(f"hall{n}", SMALL, SensorModel())[0] for n in range(5)]
+    for row in rows[:4]:
+        store.append(row, new_of(pushed(0, 0)))
+        folding.fold(row)
+    sizes = sum(cache.size_bytes for cache in folding._caches.values())
+    folding._memory = FoldMemory(cells_bytes=int(1.1 * sizes / (1 - PLAN_SHARE)))
+    for row in rows[:4]:
+        folding.fold(row)
+    assert [name for name, cache in folding._caches.items() if cache.size_bytes] == [row.name for row in rows[:4]]
+    # One more than fits: the one that was folded longest ago goes.
+    store.append(rows[4], new_of(pushed(0, 0)))
+    folding.fold(rows[4])
+    assert [name for name, cache in folding._caches.items() if cache.size_bytes] == [row.name for row in rows[1:]]
     folding.close()

@@ -1,6 +1,7 @@
 """Processes that fold one store: each map is one's at a time, nothing is folded twice, no dead one is waited for."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from itertools import islice
 
 import pytest
 from tests.fixtures.map.made import SMALL
@@ -14,7 +15,7 @@ from tests.memory_store.store import MemoryStore
 
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.folding.damaged_cells import DamagedCells
-from cairn_server.folding.fold_thread import FoldThread
+from cairn_server.folding.fold_thread import CLAIM_MAX, FoldThread
 from cairn_server.folding.readiness import FoldHealth
 from cairn_server.metrics import ServerFigures
 from cairn_server.store.store import LEASE_S
@@ -52,14 +53,14 @@ class TestMemoryLeases(LeaseContract):
         store.leases._steady_s.now_s += LEASE_S + 1.0
 
 
-def folder(store: MemoryStore, folded: list[tuple[str, int]] | None = None) -> FoldThread:
-    """A thread as each process has one; with a list, it notes the maps that it folds."""
+def folder(store: MemoryStore, on_fold: Callable[[MapRow], None] = lambda row: None) -> FoldThread:
+    """A thread as each process has one."""
     return FoldThread(
         store,
         FoldHealth(ServerFigures()),
         DamagedCells(),
         keep_evidence_s=1e9,
-        on_fold=lambda row: folded.append((row.name, row.number)) if folded is not None else None,
+        on_fold=on_fold,
         may_forget_s=lambda name: 1e9,
     )
 
@@ -69,8 +70,9 @@ def maps_of(store: MemoryStore, count: int) -> list[MapRow]:
 
 
 def test_two_that_fold_together_fold_all_once_and_never_a_map_at_the_same_time(store: MemoryStore) -> None:
-    rows, folded = maps_of(store, 40), ([], [])  # type: ignore[var-annotated]
-    folders = [folder(store, each) for each in folded]
+    rows = maps_of(store, 40)
+    folded: tuple[list[MapRow], list[MapRow]] = ([], [])
+    folders = [folder(store, each.append) for each in folded]
     for commit in COMMITS:
         for row in rows:
             store.append(row, new_of(commit))
@@ -79,7 +81,7 @@ def test_two_that_fold_together_fold_all_once_and_never_a_map_at_the_same_time(s
     until(lambda: not store.waiting_maps(), "all is folded")
     for thread in folders:
         thread.close()
-    assert not {name for name, _ in folded[0]} & {name for name, _ in folded[1]}, "the clock stands: claims last"
+    assert not {row.name for row in folded[0]} & {row.name for row in folded[1]}, "the clock stands: claims last"
     for row in rows:
         assert read(bodies(store, row)) == sum_of(COMMITS)
         with store.snapshot(row) as snapshot:
@@ -115,3 +117,37 @@ def test_what_one_folded_while_it_had_lost_its_claim_is_not_folded_twice(store: 
     assert read(bodies(store, row)) == sum_of(COMMITS)
     with store.snapshot(row) as snapshot:
         assert snapshot.head.seq == len(COMMITS)
+
+
+def test_of_many_maps_that_wait_each_has_its_turn_and_no_look_lists_them_all(
+    store: MemoryStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows, folded, looks = maps_of(store, 2 * CLAIM_MAX + 3), list[int](), list[int]()
+    more = {row.number: iter(COMMITS[1:4]) for row in rows[:CLAIM_MAX]}
+    next_waiting = store.next_waiting
+
+    def looked(*, after: int, limit: int) -> list[MapRow]:
+        found = next_waiting(after=after, limit=limit)
+        looks.append(len(found))
+        return found
+
+    def pushed_again(row: MapRow) -> None:
+        folded.append(row.number)
+        for commit in islice(more.get(row.number, iter(())), 1):
+            store.append(row, new_of(commit))
+
+    monkeypatch.setattr(store, "next_waiting", looked)
+    for row in rows:
+        store.append(row, new_of(COMMITS[0]))
+    thread = folder(store, on_fold=pushed_again)
+    until(lambda: not store.waiting_maps(), "all is folded")
+    thread.close()
+    assert max(looks) == CLAIM_MAX
+    # Maps that robots push to all the time let each other one have its turn.
+    others = [folded.index(row.number) for row in rows[CLAIM_MAX:]]
+    assert max(others) < min(nth(folded, row.number, 2) for row in rows[:CLAIM_MAX])
+
+
+def nth(found: list[int], wanted: int, n: int) -> int:
+    """Place of the n-th repetition of a number."""
+    return [place for place, each in enumerate(found) if each == wanted][n - 1]

@@ -45,6 +45,16 @@ WITH waiting AS (
 """SQL of the commits to be folded: one statement, since it is asked for a single commit most often. Of one that is
 folded, what its retract names is still to be done, and its own evidence, cold perhaps, is not needed."""
 
+NEXT_WAITING = f"""
+WITH RECURSIVE waiting AS (
+    (SELECT map FROM commits WHERE {IS_WAITING} AND map > %s ORDER BY map LIMIT 1)
+    UNION ALL
+    SELECT (SELECT map FROM commits WHERE {IS_WAITING} AND map > waiting.map ORDER BY map LIMIT 1)
+    FROM waiting WHERE waiting.map IS NOT NULL
+)
+SELECT map FROM waiting WHERE map IS NOT NULL LIMIT %s"""
+"""SQL of the maps above a number that have commits to be folded, by number: a look at each one's first, not at all."""
+
 
 class _StoredColumns(NamedTuple):
     """Columns of `STORED`."""
@@ -108,14 +118,11 @@ class PgReads:
 
     def waiting_maps(self) -> list[MapRow]:
         """Maps with commits to be folded, or with a retract under way, by name."""
-        # A look at each map's first waiting commit, and not at all that wait.
-        next_map = f"SELECT map FROM commits WHERE {IS_WAITING} AND map > waiting.map ORDER BY map LIMIT 1"
-        waiting = (
-            f"WITH RECURSIVE waiting AS ((SELECT map FROM commits WHERE {IS_WAITING} ORDER BY map LIMIT 1)"
-            f" UNION ALL SELECT ({next_map}) FROM waiting WHERE waiting.map IS NOT NULL)"
-            " SELECT map FROM waiting WHERE map IS NOT NULL"
-        )
-        return self.map_rows(f"WHERE map IN ({waiting}) ORDER BY name", ())
+        return self.map_rows(f"WHERE map IN ({NEXT_WAITING}) ORDER BY name", (-1, None))
+
+    def next_waiting(self, *, after: int, limit: int) -> list[MapRow]:
+        """The first of these maps whose numbers are above one, by number."""
+        return self.map_rows(f"WHERE map IN ({NEXT_WAITING}) ORDER BY map", (after, limit))
 
     def maps_with_evidence(self, *, before_s: float) -> list[MapRow]:
         """Maps with evidence of commits folded before an age of the store, by name."""

@@ -162,7 +162,7 @@ class PgStore(PgReads):
         self.health = PgHealth(
             self._connections, self._threads, self.age, objects=self._objects, size_bytes_max=size_bytes_max
         )
-        self.leases = PgLeases(self._connections)
+        self.leases = PgLeases(self._noting)
         self.notes = PgBranches(self._connections, self._threads)
         self.replicas = PgReplicaNotes(url, self._connections, self._noting, self.notes)
         self._names: dict[str, tuple[MapRow, float]] = {}  # with the time until which a map is known by its name

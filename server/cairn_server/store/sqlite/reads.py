@@ -50,6 +50,11 @@ class SqliteReads:
         """Maps with commits to be folded, or with a retract under way, by name."""
         return self.map_rows(f"WHERE number IN ({WAITING_MAPS}) ORDER BY name", ())
 
+    def next_waiting(self, *, after: int, limit: int) -> list[MapRow]:
+        """The first of these maps whose numbers are above one, by number."""
+        clause = f"WHERE number > ? AND number IN ({WAITING_MAPS}) ORDER BY number LIMIT ?"
+        return self.map_rows(clause, (after, limit))
+
     def maps_with_evidence(self, *, before_s: float) -> list[MapRow]:
         """Maps with evidence of commits folded before an age of the store, by name."""
         kept = (
