@@ -105,6 +105,10 @@ class Assignment(_Model):
         """Names of all layers, first those that it maps into."""
         return (*(each.layer for each in self.contributes), *self.fetches)
 
+    def layers_at(self, place_m: Corner) -> tuple[str, ...]:
+        """Names of the layers that take a scan from a place, metres, map frame."""
+        return tuple(each.layer for each in self.contributes if each.takes(place_m))
+
 
 class RobotAssignment(_Model):
     """Assignment of a robot on a map."""

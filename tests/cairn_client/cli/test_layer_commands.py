@@ -14,7 +14,7 @@ from tests.fixtures.commands import cairn
 from cairn_client.folders.map_folder import layers_of, open_layers, open_map
 from cairn_client.folders.state_folder import opened_replica
 from cairn_client.http.api import MapApi
-from cairn_client.robot.layered_robot import lend_keys
+from cairn_client.robot.layer_folders import lend_keys
 from cairn_client.robot.robot import Robot
 from cairn_fusion.recording.recording_writer import RecordingWriter
 from cairn_fusion.recording.scan import Scan

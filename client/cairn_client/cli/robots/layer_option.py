@@ -15,7 +15,7 @@ from cairn_client.folders.state_folder import is_state_folder
 from cairn_client.http.map_url import layer_url, split_map_url
 from cairn_client.replica.replica_state import ReplicaState
 from cairn_client.replica.replica_store import ReplicaStore
-from cairn_client.robot.layered_robot import lend_stored_keys
+from cairn_client.robot.layer_folders import lend_stored_keys
 from cairn_map.commits.ids import map_of_layer, robot_name
 from cairn_map.epochs.layer import EVIDENCE
 from cairn_map.errors import BadInputError, ConflictError, NotFoundError
