@@ -172,7 +172,7 @@ class LayeredSnapshot:
         return MapImage(np.concatenate(parts), _origin(x, y), edge_m)
 
     def _points_of(self, what: str) -> Callable[[Floats], npt.NDArray[Any]]:
-        """What `layer_at` asks for each point: a state, a probability, log odds, or the mean of a channel."""
+        """Query that `layer_at` makes of points: for the state, a probability, log odds, or the mean of a channel."""
         match what:
             case "state":
                 return self.state_at
