@@ -73,7 +73,7 @@ class LayerFolders:
 
 
 def lend_keys(replica: Replica, folder: Path) -> None:
-    """Let a robot's other folder, which is not open, sign with the keys that vouch for its name in this one.
+    """Let another folder of an open robot, which is not open itself, sign with the keys that vouch for its name.
 
     Raises:
         BadInputError: the folder is another robot's.
@@ -83,7 +83,7 @@ def lend_keys(replica: Replica, folder: Path) -> None:
 
 
 def lend_stored_keys(state: ReplicaState, robot: RobotName, folder: Path) -> None:
-    """`lend_keys`, out of the state of a folder that no robot works in.
+    """Let another folder of a robot, which is not open, sign with the keys that vouch for its name in this state.
 
     Raises:
         BadInputError: the folder is another robot's.
