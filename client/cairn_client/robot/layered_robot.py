@@ -127,7 +127,7 @@ class LayeredRobot:
         self._robots: dict[str, Robot] = {}
         """By layer; replaced, never altered."""
         self._left: dict[str, Commit] = {}
-        """Commits of layers when they were left, for the caller; one a layer, as its next scan hands it out."""
+        """Commits made when layers were left, until `commit` or `observe` returns them; one a layer at most."""
         self._every_s: float | None = None
         self._watch: SyncThread | None = None
         self._is_assigned = own is None
@@ -194,6 +194,8 @@ class LayeredRobot:
     def observe(self, scan: Scan, *, into: Sequence[str] | None = None) -> dict[str, Commit]:
         """Add a scan to the open measurements; the commits of the scans before, where this one begins another epoch.
 
+        So it is with the first scan in a layer that was left and is mapped into again.
+
         Args:
             scan: one head pose, all its images.
             into: layers of `contributes`; None: those that take scans from its place, which may be none.
@@ -210,7 +212,7 @@ class LayeredRobot:
                 if layer not in mapped:
                     raise BadInputError("bad_layer", f"this robot maps into {mapped}, not into {layer[:32]!r}")
             found = {layer: self._robots[layer].observe(scan) for layer in into}
-            # A layer that was left and is mapped into again: its next commit would take the place of the one of then.
+            # Else the layer's next commit would take the place of the one that was made when it was left.
             found |= {layer: self._left.pop(layer) for layer in into if layer in self._left}
         return {layer: commit for layer, commit in found.items() if commit is not None}
 
