@@ -8,6 +8,9 @@ from cairn_map.epochs.layer import EVIDENCE, LAYERS_MAX, LayerDefinition, MapLay
 from cairn_map.errors import BadInputError, ConflictError, NotFoundError
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 
+ASSIGNMENTS_MAX = 4096
+"""Robots of a map to which operators assigned layers: their names are free, so there is no end of them otherwise."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GoneMap:
@@ -93,6 +96,20 @@ def check_layer_count(name: str, further: int) -> None:
             "too_many_layers",
             f"map {name} has {further} layers besides {EVIDENCE}, and a map at most {LAYERS_MAX} in all; make another "
             "map for more",
+        )
+
+
+def check_assignment_count(name: str, others: int) -> None:
+    """Refuse the assignment of one more robot on a map where as many robots as may be have one.
+
+    Raises:
+        ConflictError: kind `too_many_assignments`.
+    """
+    if others >= ASSIGNMENTS_MAX:
+        raise ConflictError(
+            "too_many_assignments",
+            f"{others} robots have layers of map {name} assigned, and at most {ASSIGNMENTS_MAX} may: take those of "
+            "robots that are gone back (`cairn map layer assign URL ROBOT --none`)",
         )
 
 

@@ -9,6 +9,7 @@ from tests.memory_store.maps import MemoryMaps
 
 from cairn_map.commits.cursor import ENTRY_FOLD
 from cairn_map.errors import NotFoundError, UnreachableError
+from cairn_server.map_refusals import check_assignment_count
 from cairn_server.store.shares import full_authors
 from cairn_server.store.store_age import StoreAge
 from cairn_server.store.store_rows import (
@@ -180,12 +181,13 @@ class MemoryNotes:
         with self._maps.changing(row) as changed:
             changed.assignments.pop(robot, None)
             if assignment is not None:
+                check_assignment_count(row.name, len(changed.assignments))
                 changed.assignments[robot] = assignment
 
-    def assignments(self, row: MapRow) -> dict[str, str]:
-        """Assignments of a map, by robot."""
+    def assignments(self, row: MapRow, robot: str | None = None) -> dict[str, str]:
+        """Assignments of a map by robot: of all, or (one at most) of a robot."""
         with self._maps.reading(row) as state:
-            return dict(sorted(state.assignments.items()))
+            return {name: text for name, text in sorted(state.assignments.items()) if robot in (None, name)}
 
 
 def _size_bytes(state: MemoryMap) -> int:

@@ -16,6 +16,7 @@
     $ cairn map layer assign http://127.0.0.1:8750/maps/lab mole --contributes evidence,fine --inside fine=0,0,0,4,3,2
     mole maps into evidence, fine in a box
     $ cairn map layer assigned http://127.0.0.1:8750/maps/lab
+    mole maps into evidence, fine in a box
 
 A map begins with one layer, `evidence`, and has at most 16. Each is pushed to, fetched, queried, drawn and exported
 under its own URL, by every command that takes a map's: MAP.LAYER. Robots' names, tokens, marks and the sensor model are
@@ -25,9 +26,9 @@ relays carry it, and it never changes; another definition under the same name is
 server that is joined later. It takes an operator's token to add one.
 
 `assign` says which layers a robot maps into, everywhere or where its head is inside or outside of a box, and which
-others it fetches. A robot that leaves it to operators (`cairn.LayeredRobot` without `contributes`) follows it from its
-next round on, `cairn robot run --assigned` when it starts; --none leaves it to the robot's own program again. It is
-kept by this server alone.
+others it fetches. A robot that leaves it to operators (`cairn.LayeredRobot` without `contributes`) asks for it as often
+as it does rounds, `cairn robot run --assigned` when it starts, for one layer everywhere; --none leaves it to the
+robot's own program again. It is kept by this server alone.
 
 A layer with --classes counts what label images show (RECORDING.md; `labels` of a scan): names of at most 63 classes,
 by commas or one a line in a file, to which `other` is added. They are fixed with the layer: more are another layer.
@@ -107,7 +108,7 @@ def _add_assign(commands: Subparsers) -> None:
             action="append",
             default=[],
             metavar="LAYER=X0,Y0,Z0,X1,Y1,Z1",
-            help=f"map into this layer only where its head is {side} this box, metres; may be repeated",
+            help=f"map into this layer only where its head is {side} this box, metres; once for each layer",
         )
     assign.add_argument("--none", action="store_true", help="leave its layers to its own program again")
 
@@ -120,6 +121,8 @@ def _add_assigned(commands: Subparsers) -> None:
 def _assign(args: argparse.Namespace) -> int:
     if args.none == (args.contributes is not None):
         raise BadInputError("bad_option", "say --contributes LAYER,... or, to take it back, --none")
+    if args.none and (args.fetches or args.inside or args.outside):
+        raise BadInputError("bad_option", "--none takes all back: it goes with no --fetches, --inside or --outside")
     assignment = None if args.none else _assignment(args)
     api, name = api_of(args.map, args.token)
     with api:
@@ -128,7 +131,7 @@ def _assign(args: argparse.Namespace) -> int:
             say(f"{args.robot} maps as its own program says")
         else:
             api.assign(name, args.robot, assignment)
-            say(_assignment_line(args.robot, assignment))
+            say(f"{args.robot} maps into {assignment.summary}")
     return 0
 
 
@@ -136,9 +139,13 @@ def _assignment(args: argparse.Namespace) -> Assignment:
     """The options as an assignment.
 
     Raises:
-        BadInputError: kind `bad_layer`: it cannot be; `bad_option`: a box of a layer that the robot does not map into.
+        BadInputError: kind `bad_layer`: it cannot be; `bad_option`: a box of a layer that the robot does not map into,
+            or a second one.
     """
-    mapped: dict[str, dict[str, object]] = {name: {"layer": name} for name in args.contributes.split(",")}
+    names = args.contributes.split(",")
+    mapped: dict[str, dict[str, object]] = {name: {"layer": name} for name in names}
+    if len(mapped) != len(names):
+        raise BadInputError("bad_layer", f"--contributes names a layer once, got {args.contributes!r}")
     for side in ("inside", "outside"):
         for text in getattr(args, side):
             layer, _, corners = text.partition("=")
@@ -147,6 +154,8 @@ def _assignment(args: argparse.Namespace) -> Assignment:
                 raise BadInputError(
                     "bad_option", f"--{side} takes LAYER=X0,Y0,Z0,X1,Y1,Z1 of a layer in --contributes, got {text!r}"
                 )
+            if f"{side}_m" in mapped[layer]:
+                raise BadInputError("bad_option", f"--{side} names one box of a layer, got a second one of {layer}")
             mapped[layer][f"{side}_m"] = [numbers[:3], numbers[3:]]
     try:
         return Assignment.model_validate(
@@ -164,19 +173,10 @@ def _assigned(args: argparse.Namespace) -> int:
         say(json.dumps([each.model_dump(mode="json", exclude_none=True) for each in found]))
         return 0
     for each in found:
-        say(_assignment_line(each.robot, each.assignment))
+        say(f"{each.robot} maps into {each.assignment.summary}")
     if not found:
         say("(none: every robot maps as its own program says)")
     return 0
-
-
-def _assignment_line(robot: str, assignment: Assignment) -> str:
-    mapped = [
-        layer.layer + " in a box" * (layer.inside_m is not None) + " outside of a box" * (layer.outside_m is not None)
-        for layer in assignment.contributes
-    ]
-    fetched = f"; fetches {', '.join(assignment.fetches)}" if assignment.fetches else ""
-    return f"{robot} maps into {', '.join(mapped)}{fetched}"
 
 
 def _add(args: argparse.Namespace) -> int:

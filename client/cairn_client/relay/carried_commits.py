@@ -15,6 +15,7 @@ from cairn_client.relay.carried_attachments import hand_over_attachments
 from cairn_client.relay.link import RelayApi, ServerEnd, hold_between
 from cairn_client.relay.round import RelayReport, Undelivered, log_report, relay_round
 from cairn_client.replica.attachment_folder import ATTACHMENTS, AttachmentFolder
+from cairn_client.replica.durable_file import write_durable_file
 from cairn_map.commits.attachment import Attachment
 from cairn_map.commits.commit import CommitMeta
 from cairn_map.commits.commit_reading import validated_commit
@@ -28,8 +29,6 @@ FOLDER = "carried"
 
 SERVERS_OWN = (OPERATOR, INITIAL)
 """Authors in whose name servers speak, by keys that only a server knows whether to trust."""
-COMING = ".coming"
-"""Suffix of the name of a file that is not whole."""
 ATTACHMENTS_SHARE = 4
 """A quarter of the folder's room is for attachments of marks."""
 ATTACHMENTS_BYTES_MAX = 1 << 32
@@ -90,16 +89,9 @@ class CarriedCommits:
         """
         meta = self._check(commit)
         content = (commit.signatures or "").encode() + b"\n" + commit.data
-        path = self._folder / str(commit.id)
-        coming = path.with_name(path.name + COMING)
         try:
             self._make_room(len(content))
-            with coming.open("wb") as file:
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())
-            coming.replace(path)
-            _sync_folder(self._folder)
+            write_durable_file(self._folder / str(commit.id), content)
             for mark in meta.marks:
                 if mark.attachment is not None:
                     self._attachments.await_one(mark.attachment)
@@ -154,14 +146,6 @@ class CarriedCommits:
                 yield commit_id_from_text(path.name), path
             except BadInputError:
                 continue  # not whole, or somebody else's
-
-
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 class Carrier:

@@ -7,10 +7,10 @@ Files are compared with their names when they are read: what is damaged is as go
 """
 
 import hashlib
-import os
 import re
 from pathlib import Path
 
+from cairn_client.replica.durable_file import write_durable_file
 from cairn_map.commits.attachment import ATTACHMENT_BYTES_MAX, Attachment, attachment_of
 from cairn_map.errors import UnreachableError
 
@@ -18,8 +18,6 @@ ATTACHMENTS = "attachments"
 """Name of the folder, in that of a robot or a relay."""
 FILE = re.compile(r"[0-9a-f]{64}")
 AWAITED = re.compile(r"([0-9a-f]{64})\.([1-9][0-9]{0,7})")
-COMING = ".coming"
-"""Suffix of the name of a file that is not whole."""
 
 
 class AttachmentFolder:
@@ -57,18 +55,7 @@ class AttachmentFolder:
         if self.read(made.sha256) is not None:
             return made
         self._check_room(made.size_bytes)
-        path = self._folder / made.sha256
-        coming = path.with_name(path.name + COMING)
-        try:
-            self._folder.mkdir(0o700, parents=True, exist_ok=True)
-            with coming.open("wb") as file:
-                file.write(data)
-                file.flush()
-                os.fsync(file.fileno())
-            coming.replace(path)
-            self._sync()
-        except OSError as exc:
-            raise UnreachableError("store_failed", f"cannot write to {self._folder}: {exc.strerror}") from exc
+        write_durable_file(self._folder / made.sha256, data)
         self._forget_awaited(made.sha256)
         return made
 
@@ -138,10 +125,3 @@ class AttachmentFolder:
             return []
         except OSError as exc:
             raise UnreachableError("store_failed", f"cannot read {self._folder}: {exc.strerror}") from exc
-
-    def _sync(self) -> None:
-        descriptor = os.open(self._folder, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)

@@ -10,7 +10,8 @@
 
 A layer may be mapped into by place (`MappedLayer`): outdoors the level, in the building the evidence. Without
 `contributes` the layers are those that operators assigned to the robot (`cairn map layer assign`): it asks the server
-for them when it is opened and in each round, and changes its layers by the answer.
+for them when it is opened, with each `sync`, and in the background as often as `start_sync` says, and changes its
+layers by the answer. `observe` and `commit` wait for no server.
 
 Each layer is a `Robot` of its own (`robots`), in a folder of its own below the robot's. Its name is bound to one key on
 the map, in all layers, so the folders lend each other the keys that vouch for it.
@@ -18,8 +19,8 @@ the map, in all layers, so the folders lend each other the keys that vouch for i
 
 import logging
 import threading
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, closing
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -31,14 +32,13 @@ from pydantic import ValidationError
 from cairn_calib.rig.rig import Rig
 from cairn_client.http.api import MapApi
 from cairn_client.http.map_url import layer_url, split_map_url
+from cairn_client.replica.durable_file import write_durable_file
 from cairn_client.replica.limits import Limits
-from cairn_client.replica.replica import Replica
-from cairn_client.replica.replica_state import ReplicaState, RobotKeys
-from cairn_client.replica.replica_store import ReplicaStore
 from cairn_client.robot.amending import AnyCommit
+from cairn_client.robot.layer_folders import LayerFolders
 from cairn_client.robot.membership import own_token
 from cairn_client.robot.robot import Robot
-from cairn_client.robot.rounds import FLUSH_S, FOLDED_WITHIN_S
+from cairn_client.robot.rounds import FLUSH_S, FOLDED_WITHIN_S, SyncThread
 from cairn_client.robot.server_clock import Times
 from cairn_client.sync.link_profile import LinkName
 from cairn_client.sync.scope import EVERYTHING, Scope
@@ -46,8 +46,9 @@ from cairn_client.sync.sync import RoundReport
 from cairn_fusion.mapping.integrate import Integrator
 from cairn_fusion.recording.scan import Scan
 from cairn_map.commits.commit import Commit
-from cairn_map.commits.ids import RobotName, map_of_layer, robot_name
-from cairn_map.errors import BadInputError, CairnError, NotFoundError, UnreachableError, first_error
+from cairn_map.commits.ids import map_of_layer, robot_name
+from cairn_map.epochs.layer import EVIDENCE, MapLayer
+from cairn_map.errors import BadInputError, CairnError, DeniedError, NotFoundError, UnreachableError, first_error
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.queries.layers.layered_snapshot import LayeredSnapshot
 from cairn_map.wire.layer_messages import Assignment, MappedLayer
@@ -66,6 +67,9 @@ READS: Mode = "viewer"
 
 class LayeredRobot:
     """One robot's part in several layers of a map; by one thread, but any may take a `snapshot`.
+
+    Locks: `_changing` is held while layers are opened and left, which takes the link, and by a `sync`; `_lock`, within
+    it, while scans are added, commits made, and the layers exchanged: never while a server is asked.
 
     Args:
         rig: head whose scans will come.
@@ -105,6 +109,8 @@ class LayeredRobot:
     ) -> None:
         """Open or make the folders; the server is asked for the grid of each layer that was never opened.
 
+        An assigned layer that cannot be opened now is opened later, if there is another one to map into.
+
         Raises:
             BadInputError: kind `bad_layer`: no layer to map into, or one that is named twice; `layer_of_map`: the URL
                 is that of a layer.
@@ -115,14 +121,18 @@ class LayeredRobot:
             raise BadInputError("layer_of_map", f"{map_url} is a layer: take the map's URL, and name its layers")
         own = None if contributes is None else _assignment_of(contributes, fetches)
         self._map_url, self._folder, self._name, self._token = map_url, Path(directory), robot_name(name), token
+        self._folders = LayerFolders(self._folder, self._name, map_url)
         self._stay = stay
+        self._changing, self._lock = threading.Lock(), threading.RLock()
         self._robots: dict[str, Robot] = {}
-        self._roles: dict[str, str] = {}
+        """By layer; replaced, never altered."""
+        self._left: dict[str, Commit] = {}
+        """Commits made when layers were left, until `commit` or `observe` returns them; one a layer at most."""
         self._every_s: float | None = None
-        self._watch: AssignmentWatch | None = None
+        self._watch: SyncThread | None = None
         self._is_assigned = own is None
 
-        def opened_layer(layer: str, mode: Mode) -> Robot:
+        def opened_layer(layer: str, mode: Mode, grid: MapLayer | None) -> Robot:
             return Robot(
                 rig if mode == MAPS else None,
                 layer_url(map_url, layer),
@@ -130,6 +140,7 @@ class LayeredRobot:
                 name=name,
                 token=token,
                 mode=mode,
+                geometry=grid,
                 integrator=integrators.get(layer),
                 scope=scope,
                 limits=limits,
@@ -142,7 +153,7 @@ class LayeredRobot:
         self._open_layer = opened_layer
         self._wanted = own if own is not None else self._first_assignment()
         try:  # what was opened is closed again if a later one fails
-            self._reconcile(is_first=True)
+            self._open_first()
         except BaseException:
             self._close_all(stay=True, flush_s=0.0)
             raise
@@ -170,7 +181,10 @@ class LayeredRobot:
     @property
     def contributes(self) -> tuple[str, ...]:
         """Layers that it maps into, somewhere."""
-        return tuple(each.layer for each in self._wanted.contributes if self._roles.get(each.layer) == MAPS)
+        robots = self._robots
+        return tuple(
+            each.layer for each in self._wanted.contributes if each.layer in robots and robots[each.layer].mode == MAPS
+        )
 
     @property
     def assignment(self) -> Assignment:
@@ -180,6 +194,8 @@ class LayeredRobot:
     def observe(self, scan: Scan, *, into: Sequence[str] | None = None) -> dict[str, Commit]:
         """Add a scan to the open measurements; the commits of the scans before, where this one begins another epoch.
 
+        So it is with the first scan in a layer that was left and is mapped into again.
+
         Args:
             scan: one head pose, all its images.
             into: layers of `contributes`; None: those that take scans from its place, which may be none.
@@ -187,26 +203,31 @@ class LayeredRobot:
         Raises:
             BadInputError: kind `bad_layer`: this robot does not map into one of them; or as `Robot.observe`.
         """
-        self._take_news()
-        mapped = self.contributes
-        if into is None:
-            x, y, z = np.asarray(scan.T_map_rig, np.float64)[:3, 3].tolist()
-            into = [each.layer for each in self._wanted.contributes if each.layer in mapped and each.takes((x, y, z))]
-        for layer in into:
-            if layer not in mapped:
-                raise BadInputError("bad_layer", f"this robot maps into {mapped}, not into {layer[:32]!r}")
-        found = {layer: self._robots[layer].observe(scan) for layer in into}
+        with self._lock:
+            mapped = self.contributes
+            if into is None:
+                x, y, z = np.asarray(scan.T_map_rig, np.float64)[:3, 3].tolist()
+                into = [layer for layer in self._wanted.layers_at((x, y, z)) if layer in mapped]
+            for layer in into:
+                if layer not in mapped:
+                    raise BadInputError("bad_layer", f"this robot maps into {mapped}, not into {layer[:32]!r}")
+            found = {layer: self._robots[layer].observe(scan) for layer in into}
+            # Else the layer's next commit would take the place of the one that was made when it was left.
+            found |= {layer: self._left.pop(layer) for layer in into if layer in self._left}
         return {layer: commit for layer, commit in found.items() if commit is not None}
 
     def commit(self, *, note: str = "") -> dict[str, Commit]:
         """Commit the open measurements, by layer; durable here. One commit a layer, where there is evidence.
 
+        Those of layers that were left since the last call, which were committed then, are among them.
+
         Raises:
             CairnError: as `Robot.commit`; the layers before it are committed, and may be committed again.
         """
-        self._take_news()
-        found = {layer: self._robots[layer].commit(note=note) for layer in self.contributes}
-        return {layer: commit for layer, commit in found.items() if commit is not None}
+        with self._lock:
+            found = {layer: self._robots[layer].commit(note=note) for layer in self.contributes}
+            left, self._left = self._left, {}
+        return left | {layer: commit for layer, commit in found.items() if commit is not None}
 
     def amend(
         self,
@@ -227,10 +248,11 @@ class LayeredRobot:
         Raises:
             CairnError: as `Robot.amend`; the layers before it are amended, and may be amended again.
         """
-        return {
-            layer: robot.amend(measurement[layer], T_map_rig, T_map_observed=T_map_observed, note=note)
-            for layer, robot in self._mapping(measurement)
-        }
+        with self._lock:
+            return {
+                layer: robot.amend(measurement[layer], T_map_rig, T_map_observed=T_map_observed, note=note)
+                for layer, robot in self._mapping(measurement)
+            }
 
     def retract(self, measurement: Mapping[str, AnyCommit], *, note: str = "") -> dict[str, Commit]:
         """Take a past measurement back in all its layers, each as `Robot.retract`.
@@ -242,32 +264,42 @@ class LayeredRobot:
         Raises:
             CairnError: as `Robot.retract`; the layers before it are taken back.
         """
-        return {layer: robot.retract(measurement[layer], note=note) for layer, robot in self._mapping(measurement)}
+        with self._lock:
+            return {layer: robot.retract(measurement[layer], note=note) for layer, robot in self._mapping(measurement)}
 
     def sync(self, *, until_folded: bool = False, within_s: float = FOLDED_WITHIN_S) -> dict[str, RoundReport]:
         """One round with the server for each layer, after a look for the layers that operators assigned.
 
         Raises:
-            CairnError: as `Robot.sync`.
+            UnreachableError: no link; the layers after the first one without had no round.
+            CairnError: as `Robot.sync` of the first layer that failed; all the others had their rounds.
         """
-        if self._is_assigned:
-            self._take(self._asked())
-        reports = {
-            layer: robot.sync(until_folded=until_folded, within_s=within_s) for layer, robot in self._robots.items()
-        }
-        self._reconcile()  # what was left to push is pushed
+        refusal: CairnError | None = None
+        with self._changing:
+            if self._is_assigned:
+                self._look()
+            modes, reports = self._modes(), dict[str, RoundReport]()
+            for layer, robot in self._robots.items():
+                try:
+                    reports[layer] = robot.sync(until_folded=until_folded, within_s=within_s)
+                except CairnError as exc:
+                    if exc.kind == "no_link":
+                        raise
+                    log.warning("layer %s: %s: %s", layer, exc.kind, exc.message)
+                    refusal = refusal or exc
+            if any(modes.get(layer) != robot.mode for layer, robot in self._robots.items()):
+                self._reconcile()  # what was left to push is pushed
+        if refusal is not None:
+            raise refusal
         return reports
 
     def start_sync(self, *, every_s: float = 5.0) -> None:
-        """Sync all layers in the background, as `Robot.start_sync`.
-
-        Layers that operators assign meanwhile are opened by the next `observe`, `commit` or `sync`.
-        """
+        """Sync all layers in the background, as `Robot.start_sync`; layers that operators assign are taken there."""
         self._every_s = every_s
         for robot in self._robots.values():
             robot.start_sync(every_s=every_s)
         if self._is_assigned and self._watch is None:
-            self._watch = AssignmentWatch(self._asked, every_s=every_s)
+            self._watch = SyncThread(self._follow, every_s=every_s, on_failure=lambda exc, wait_s: None)
 
     def snapshot(self, model: SensorModel | None = None, *, at_s: float | None = None) -> LayeredSnapshot:
         """All layers as they are here now, of which the finest that knows a point answers for it; by any thread.
@@ -275,7 +307,14 @@ class LayeredRobot:
         Raises:
             ConflictError: kind `not_known`: with `at_s`, a layer has no epochs.
         """
-        return LayeredSnapshot({layer: robot.snapshot(model, at_s=at_s) for layer, robot in self._robots.items()})
+        while True:
+            robots = self._robots
+            try:
+                return LayeredSnapshot({layer: robot.snapshot(model, at_s=at_s) for layer, robot in robots.items()})
+            except BadInputError as exc:
+                if exc.kind != "robot_closed" or robots is self._robots:
+                    raise
+                # The background left a layer at this moment; the others are read again.
 
     def close(self, *, stay: bool = False) -> None:
         """Close each layer's robot, as `Robot.close`."""
@@ -289,28 +328,30 @@ class LayeredRobot:
 
     def _end_watch(self) -> None:
         if self._watch is not None:
-            self._watch.stop()
+            self._watch.stop(cut=lambda: None)  # a question under way is let end
             self._watch = None
 
     def _mapping(self, measurement: Mapping[str, AnyCommit]) -> list[tuple[str, Robot]]:
+        mapped = self.contributes
         for layer in measurement:
-            if self._roles.get(layer) != MAPS:
-                raise BadInputError("bad_layer", f"this robot maps into {self.contributes}, not into {layer[:32]!r}")
+            if layer not in mapped:
+                raise BadInputError("bad_layer", f"this robot maps into {mapped}, not into {layer[:32]!r}")
         return [(layer, self._robots[layer]) for layer in measurement]
 
     def _first_assignment(self) -> Assignment:
-        """The layers that operators assigned, from the server; without a link those of last time.
+        """The layers that operators assigned, from the server; if it cannot or will not say, those of last time.
 
         Raises:
             NotFoundError: kind `no_assignment`.
-            UnreachableError: no link, and there was no last time.
+            CairnError: the server did not say, and there was no last time.
         """
         known = self._folder / ASSIGNMENT_FILE
         try:
             found = self._asked()
-        except UnreachableError:
+        except CairnError as exc:
             if not known.is_file():
                 raise
+            log.warning("the assigned layers are those of last time: %s: %s", exc.kind, exc.message)
             found = None
         if found is None and known.is_file():
             return message_from_json(Assignment, known.read_bytes())
@@ -324,95 +365,137 @@ class LayeredRobot:
         return found
 
     def _asked(self) -> Assignment | None:
-        """The layers that operators assigned, by the token of any layer, or the one given."""
-        server_url, name = split_map_url(self._map_url)
-        token = self._token
-        for layer, robot in self._robots.items():
-            own = own_token(robot.replica.state, self._map_url)
-            if own is not None:  # it counts on its layer alone
-                token, name = own, split_map_url(layer_url(self._map_url, layer))[1]
-                break
-        with MapApi(server_url, token=token) as api:
-            return api.assignment(name, self._name)
+        """The layers that operators assigned, by the robot's own token of an open layer, or those of a start."""
+        server_url = split_map_url(self._map_url)[0]
+        own = {layer: own_token(robot.replica.state, self._map_url) for layer, robot in self._robots.items()}
+        asking: list[tuple[str, str | None]] = []
+        asking += [(layer, token) for layer, token in own.items() if token is not None][:1]
+        if not asking:  # at a start, and before the first registration
+            asking += [(EVIDENCE, self._token), *self._folders.tokens(opened=own)]
+        while True:
+            layer, token = asking.pop(0)
+            try:
+                with MapApi(server_url, token=token) as api:  # a token of a layer counts on that layer alone
+                    return api.assignment(self._folders.name_of(layer), self._name)
+            except DeniedError:
+                if not asking:
+                    raise
 
-    def _take_news(self) -> None:
-        if self._watch is not None:
-            self._take(self._watch.take_news())
+    def _look(self) -> None:
+        """Take what operators assigned, by one that holds `_changing`; if the server will not say, all stays.
 
-    def _take(self, assignment: Assignment | None) -> None:
-        """Change the layers to those of an assignment; None, which is none any more, changes nothing."""
-        if assignment is not None and assignment != self._wanted:
-            self._remember(assignment)
-            self._wanted = assignment
+        Raises:
+            UnreachableError: no link.
+        """
+        try:
+            self._take(self._asked())
+        except UnreachableError:
+            raise
+        except CairnError as exc:  # the rounds of the layers prove who asks, and report what is refused
+            log.warning("the assigned layers are unknown now: %s: %s", exc.kind, exc.message)
         self._reconcile()
 
-    def _remember(self, assignment: Assignment) -> None:
-        self._folder.mkdir(parents=True, exist_ok=True)
-        new = self._folder / f"{ASSIGNMENT_FILE}.new"
-        new.write_text(assignment.model_dump_json())
-        new.replace(self._folder / ASSIGNMENT_FILE)
+    def _follow(self) -> None:
+        """Take what operators assigned, in the background.
 
-    def _reconcile(self, *, is_first: bool = False) -> None:
-        """Open the layers that are wanted, and close others, each once its commits are pushed.
-
-        A layer whose grid cannot be asked for now is opened later; the first time, that is the caller's error.
+        Raises:
+            CairnError: it is unknown now, or a layer could not be opened or left; all others are.
         """
+        with self._changing:
+            self._take(self._asked())
+            failures = self._reconcile()
+        if failures:
+            raise failures[0]
+
+    def _take(self, assignment: Assignment | None) -> None:
+        """Have another assignment from here on; None, which is none any more, changes nothing."""
+        if assignment is not None and assignment != self._wanted:
+            self._remember(assignment)
+            with self._lock:
+                self._wanted = assignment
+
+    def _remember(self, assignment: Assignment) -> None:
+        write_durable_file(self._folder / ASSIGNMENT_FILE, assignment.model_dump_json().encode())
+
+    def _open_first(self) -> None:
+        """Open the layers of a start.
+
+        Raises:
+            CairnError: a layer that the program named, or each of those that operators assigned to be mapped into,
+                cannot be opened.
+        """
+        if not self._is_assigned:
+            for layer, mode in self._modes().items():
+                self._open(layer, mode)
+            return
+        failures = self._reconcile()
+        if failures and not self.contributes:
+            raise failures[0]
+
+    def _modes(self) -> dict[str, Mode]:
+        """Mode in each layer that is wanted, first those that it maps into."""
         wanted: dict[str, Mode] = {each.layer: MAPS for each in self._wanted.contributes}
         wanted |= dict.fromkeys(self._wanted.fetches, READS)
-        for layer, robot in list(self._robots.items()):
-            if wanted.get(layer) == self._roles[layer]:
-                continue
-            if self._roles[layer] == MAPS:
-                robot.commit()
-            if not robot.waiting:  # else its rounds go on until there is nothing to push
-                self._robots = {name: each for name, each in self._robots.items() if name != layer}
-                robot.close(stay=self._stay)
-        for layer, mode in wanted.items():
-            if layer in self._robots:
-                continue
-            for other in self._robots.values():
-                lend_keys(other.replica, self._folder / layer)
+        return wanted
+
+    def _reconcile(self) -> list[CairnError]:
+        """Open the layers that are wanted, and close others, each once its commits are pushed; by one at a time.
+
+        What fails in one layer stops no other; it is tried again the next time.
+        """
+        modes, before, failures = self._modes(), self._robots, list[CairnError]()
+        # New ones first: while those that are left are open they lend their keys, and a snapshot has them.
+        for layer in [*(each for each in modes if each not in before), *before]:
             try:
-                robot = self._open_layer(layer, mode)
-            except UnreachableError as exc:
-                if is_first:
-                    raise
-                log.info("layer %s is opened later: %s", layer, exc.message)
-                continue
-            self._roles[layer] = mode
+                robot = self._robots.get(layer)
+                if robot is not None and robot.mode == modes.get(layer):
+                    continue
+                if robot is not None:
+                    self._leave(layer, robot)
+                if layer in modes and layer not in self._robots:
+                    self._open(layer, modes[layer])
+            except CairnError as exc:
+                log.warning("layer %s is tried again later: %s: %s", layer, exc.kind, exc.message)
+                failures.append(exc)
+        return failures
+
+    def _leave(self, layer: str, robot: Robot) -> None:
+        """Commit what is open in a layer, and close it if all is pushed; else its rounds go on until then."""
+        with self._lock:
+            commit = robot.commit()
+            if commit is not None:
+                self._left[layer] = commit
+            if robot.waiting:
+                return
+            self._robots = {name: each for name, each in self._robots.items() if name != layer}
+        robot.close(stay=self._stay)
+
+    def _open(self, layer: str, mode: Mode) -> None:
+        """Open a layer; the keys that vouch for the robot's name come from its other layers."""
+        self._folders.lend_to(layer, self._robots)
+        try:
+            robot = self._open_layer(layer, mode, None)
+        except DeniedError:
+            grid = self._grid_by_membership(layer)
+            if grid is None:
+                raise
+            robot = self._open_layer(layer, mode, grid)
+        with self._lock:
             self._robots = {**self._robots, layer: robot}
-            if self._every_s is not None:
-                robot.start_sync(every_s=self._every_s)
+        if self._every_s is not None:
+            robot.start_sync(every_s=self._every_s)
 
-
-class AssignmentWatch:
-    """Thread that asks now and then for the layers that operators assigned, until stopped."""
-
-    def __init__(self, ask: Callable[[], Assignment | None], *, every_s: float) -> None:
-        """Begin; `ask` returns the assignment, or raises why it is unknown now."""
-        self._ask = ask
-        self._every_s = every_s
-        self._news: Assignment | None = None
-        self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="cairn-layers", daemon=True)
-        self._thread.start()
-
-    def take_news(self) -> Assignment | None:
-        """The newest answer since the last call; None: there is none."""
-        news, self._news = self._news, None
-        return news
-
-    def stop(self) -> None:
-        """End the thread; a question under way is let end."""
-        self._stopping.set()
-        self._thread.join()
-
-    def _run(self) -> None:
-        while not self._stopping.wait(self._every_s):
-            try:
-                self._news = self._ask()
-            except CairnError as exc:  # the rounds of the layers report the link; this is asked again
-                log.debug("the assigned layers are unknown now: %s", exc.message)
+    def _grid_by_membership(self, layer: str) -> MapLayer | None:
+        """Grid of a layer, by the robot's own token of the map, which counts on all layers; None: it has none."""
+        member = self._robots.get(EVIDENCE)
+        if member is not None:
+            token = own_token(member.replica.state, self._map_url)
+        else:
+            token = dict(self._folders.tokens(opened=self._robots)).get(EVIDENCE)
+        if token is None:
+            return None
+        with MapApi(split_map_url(self._map_url)[0], token=token) as api:
+            return api.map_info(self._folders.name_of(layer)).layer
 
 
 def _assignment_of(contributes: Sequence[str | MappedLayer], fetches: Sequence[str]) -> Assignment:
@@ -431,27 +514,3 @@ def _assignment_of(contributes: Sequence[str | MappedLayer], fetches: Sequence[s
         raise BadInputError(
             "bad_layer", f"a robot maps into one layer at least, each named once, got {names}: {first_error(exc)}"
         ) from exc
-
-
-def lend_keys(replica: Replica, folder: Path) -> None:
-    """Let a robot's other folder, which is not open, sign with the keys that vouch for its name in this one.
-
-    Raises:
-        BadInputError: the folder is another robot's.
-        CairnError: it cannot be opened.
-    """
-    lend_stored_keys(replica.state, replica.author.robot, folder)
-
-
-def lend_stored_keys(state: ReplicaState, robot: RobotName, folder: Path) -> None:
-    """`lend_keys`, out of the state of a folder that no robot works in.
-
-    Raises:
-        BadInputError: the folder is another robot's.
-        CairnError: it cannot be opened.
-    """
-    with closing(ReplicaStore(folder)) as store:
-        other = ReplicaState(store)
-        if other.robot not in (None, robot):
-            raise BadInputError("other_replica", f"{folder} belongs to robot {other.robot}, not to {robot}")
-        RobotKeys(other, robot).borrow(RobotKeys(state, robot).vouching())

@@ -8,6 +8,7 @@ Each maps into the layer of the place where it is, and fetches both.
 
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -96,9 +97,8 @@ def show_yard(
         CairnError: two maps differ, the ground is not as it should be, or the server failed.
     """
     start_s, scene = time.monotonic(), load_scene(SCENE)
-    with demo_server(folder / "server") as url:
+    with demo_server(folder / "server") as url, MapApi(url) as api, ExitStack() as opened:
         console.print(f"server on {url}, its data in {folder / 'server'}")
-        api = MapApi(url)
         api.create_map(MAP, CreateMap(geometry=geometry_for(voxel_edge_m=voxel_edge_m), epoch_s=STANDARD_EPOCH_S))
         level = level_geometry()
         api.add_layer(MAP, AddLayer(name=GROUND, geometry=level, epoch_s=STANDARD_EPOCH_S))
@@ -106,21 +106,17 @@ def show_yard(
             f"map {MAP}: evidence of {voxel_edge_m * 100:g} cm for the shed, and layer {GROUND}, a level: "
             f"columns of {level.voxel_edge_m * 100:g} cm, bins of {level.voxel_height_m * 100:g} cm"
         )
-        team = [
-            YardRobot(name, plan, f"{url}/maps/{MAP}", folder / "robots")
-            for name, plan in yard_plans(scene, seed, scans).items()
-        ]
-        try:
-            for member in team:
-                console.print(f"  {member.name}: {member.plan.robot.about}; {member.stop_count} stops")
-            drive_team(team, api, console)
-            require_equal_maps(team, api, console)
-            ground = team[0].robot.snapshot()[GROUND].elevation()
-            require_true_ground(scene, ground, console)
-            _write(team[0], ground, folder, console)
-        finally:
-            for member in team:
-                member.close()
+        team: list[YardRobot] = []
+        for name, plan in yard_plans(scene, seed, scans).items():
+            member = YardRobot(name, plan, f"{url}/maps/{MAP}", folder / "robots")
+            opened.callback(member.close)
+            team.append(member)
+            console.print(f"  {member.name}: {member.plan.robot.about}; {member.stop_count} stops")
+        drive_team(team, api, console)
+        require_equal_maps(team, api, console)
+        ground = team[0].robot.snapshot()[GROUND].elevation()
+        require_true_ground(scene, ground, console)
+        _write(team[0], ground, folder, console)
     console.print(f"\ndone in {time.monotonic() - start_s:.0f} s. What to do next:")
     console.print(
         f"  look at {folder / 'ground.png'} and {folder / 'map.png'}, or open {folder / 'map.ply'} in a viewer"

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from cairn_client.robot.layered_robot import LayeredRobot
-from cairn_fusion.recording.scan import Scan
 from cairn_map.epochs.layer import EVIDENCE
 from cairn_map.errors import UnreachableError
 from cairn_map.wire.layer_messages import BoxM, MappedLayer
@@ -58,7 +57,8 @@ class YardRobot:
             CairnError: as `LayeredRobot.commit` and `sync`.
         """
         for shot, scan, _ in self._scans:
-            into = layers_at(scan)
+            x, y, z = scan.T_map_rig[:3, 3].tolist()
+            into = self.robot.assignment.layers_at((x, y, z))
             self.progress.place = (
                 "in the door" if len(into) > 1 else ("in the shed" if EVIDENCE in into else "outdoors")
             )
@@ -86,9 +86,3 @@ class YardRobot:
         """Close the robot's directories."""
         self._scans.close()
         self.robot.close()
-
-
-def layers_at(scan: Scan) -> tuple[str, ...]:
-    """Layers that the robots map into from the place of a scan."""
-    x, y, z = scan.T_map_rig[:3, 3].tolist()
-    return tuple(each.layer for each in CONTRIBUTES if each.takes((x, y, z)))

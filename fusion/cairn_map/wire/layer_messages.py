@@ -53,7 +53,7 @@ class AddLayer(_Model):
 
 
 class LayerAdded(_Model):
-    """Answer to it."""
+    """Answer to `POST /maps/{map}/layers`."""
 
     commit: IdText | None
     """Commit that defines the layer; None: an equal one was there."""
@@ -104,6 +104,19 @@ class Assignment(_Model):
     def layers(self) -> tuple[str, ...]:
         """Names of all layers, first those that it maps into."""
         return (*(each.layer for each in self.contributes), *self.fetches)
+
+    @property
+    def summary(self) -> str:
+        """Layers for people, such as `evidence, fine in a box; fetches wide`."""
+        mapped = [
+            each.layer + " in a box" * (each.inside_m is not None) + " outside of a box" * (each.outside_m is not None)
+            for each in self.contributes
+        ]
+        return ", ".join(mapped) + (f"; fetches {', '.join(self.fetches)}" if self.fetches else "")
+
+    def layers_at(self, place_m: Corner) -> tuple[str, ...]:
+        """Names of the layers that take a scan from a place, metres, map frame."""
+        return tuple(each.layer for each in self.contributes if each.takes(place_m))
 
 
 class RobotAssignment(_Model):

@@ -87,9 +87,12 @@ class BranchNotes(Protocol):
         """Keep which layers of a map a robot takes part in, as JSON, or (None) no more; durable on return.
 
         The robot need not be registered; it goes with the map alone.
+
+        Raises:
+            ConflictError: kind `too_many_assignments`.
         """
         ...
 
-    def assignments(self, row: MapRow) -> dict[str, str]:
-        """Assignments of a map, by robot."""
+    def assignments(self, row: MapRow, robot: str | None = None) -> dict[str, str]:
+        """Assignments of a map by robot: of all, or (one at most) of a robot."""
         ...

@@ -76,21 +76,20 @@ class MapLayers:
 
     def assignments(self, row: MapRow, robot: str | None = None) -> Sequence[RobotAssignment]:
         """Assignments of a map, or of the map of a layer: of all robots by name, or (one at most) of a robot."""
-        found = self._store.notes.assignments(self._whole(row))
+        found = self._store.notes.assignments(self._whole(row), robot)
         return [
-            RobotAssignment(robot=name, assignment=Assignment.model_validate_json(text))
-            for name, text in found.items()
-            if robot in (None, name)
+            RobotAssignment(robot=name, assignment=Assignment.model_validate_json(text)) for name, text in found.items()
         ]
 
     def assign(self, row: MapRow, robot: str, assignment: Assignment, *, by: Caller) -> None:
         """Say which layers of a map a robot takes part in, whether it is registered or not; durable on return.
 
-        The robot asks for it with its next round. It is of this server: relays carry none.
+        The robot asks for it as often as it does rounds. It is of this server: relays carry none.
 
         Raises:
             BadInputError: kind `layer_of_map`: the map is a layer itself; `bad_name`.
             NotFoundError: kind `no_map`: the map has no such layer.
+            ConflictError: kind `too_many_assignments`.
         """
         if row.of_map is not None:
             raise layer_of_map(row.name, "assign its layers on the map")
@@ -104,11 +103,14 @@ class MapLayers:
         """Leave a robot's layers to its program again.
 
         Raises:
+            BadInputError: kind `layer_of_map`: the map is a layer itself.
             NotFoundError: kind `no_assignment`: it has none.
         """
-        if robot not in self._store.notes.assignments(self._whole(row)):
+        if row.of_map is not None:
+            raise layer_of_map(row.name, "take its layers back on the map")
+        if not self._store.notes.assignments(row, robot):
             raise NotFoundError("no_assignment", f"robot {robot[:32]!r} has no layers assigned on map {row.name}")
-        self._store.notes.assign(self._whole(row), robot, None)
+        self._store.notes.assign(row, robot, None)
         self._store.audit_log.add(by.name, "unassign_layers", f"map {row.name}: {robot}", client=by.address)
 
     def _whole(self, row: MapRow) -> MapRow:

@@ -14,14 +14,16 @@ from tests.fixtures.commands import cairn
 from cairn_client.folders.map_folder import layers_of, open_layers, open_map
 from cairn_client.folders.state_folder import opened_replica
 from cairn_client.http.api import MapApi
-from cairn_client.robot.layered_robot import lend_keys
+from cairn_client.main import main
+from cairn_client.robot.layer_folders import lend_keys
 from cairn_client.robot.robot import Robot
 from cairn_fusion.recording.recording_writer import RecordingWriter
 from cairn_fusion.recording.scan import Scan
-from cairn_map.errors import NotFoundError
+from cairn_map.errors import NotFoundError, UnreachableError
 from cairn_map.evidence.grid import cell_key
 from cairn_map.files.cell_folder import read_cells, read_head
 from cairn_map.queries.occupancy_states import State
+from cairn_map.wire.messages import Retract, Retracted
 
 
 def sweep_of(points: np.ndarray[tuple[int, int], np.dtype[np.float64]], time_s: float) -> Scan:
@@ -41,6 +43,7 @@ def test_a_layer_is_added_listed_and_mapped_into_drawn_and_saved(server: LiveSer
     with MapApi(server.url) as api:
         (evidence, fine) = api.layers(MAP)
         assert fine.geometry.channels == evidence.geometry.channels == GEOMETRY.channels
+    assert "[empty_map]" in cairn("map", "export", server.map_url, "--ply", "m.ply", folder=tmp_path, code=3)
 
     with Robot(None, url, directory=tmp_path / "near", name="near") as robot:
         robot.replica.commit({cell_key((0, 0, 0)): seen(1, 2, 70)})
@@ -189,9 +192,14 @@ def test_robots_map_into_the_layer_that_an_option_or_an_operator_names(server: L
     said = cairn(*assign, "--contributes", "evidence,wider", "--inside", "wider=0,0,0,1,1,1", folder=tmp_path)
     assert said == "mole maps into evidence, wider in a box\n"
     assert "--layer" in replayed("--assigned", code=1)
+    # Of what one layer everywhere is not, the command leaves nothing out without a word.
+    cairn(*assign, "--contributes", "wider", "--outside", "wider=0,0,0,1,1,1", folder=tmp_path)
+    assert "wider outside of a box" in replayed("--assigned", code=1)
     cairn(*assign, "--contributes", "wider", "--fetches", "wide", folder=tmp_path)
     listed = cairn("map", "layer", "assigned", server.map_url, folder=tmp_path)
     assert listed == "mole maps into wider; fetches wide\n"
+    assert "(wider; fetches wide) is not one layer" in replayed("--assigned", code=1)
+    cairn(*assign, "--contributes", "wider", folder=tmp_path)
     replayed("--assigned")
     assert all(cells().values())
     for options, kind in (
@@ -199,13 +207,25 @@ def test_robots_map_into_the_layer_that_an_option_or_an_operator_names(server: L
         (("--contributes", "wide", "--fetches", "wide"), "bad_layer"),
         (("--contributes", "wide", "--inside", "wider=0,0,0,1,1,1"), "bad_option"),
         ((), "bad_option"),
+        (("--none", "--fetches", "wide"), "bad_option"),
+        (("--none", "--inside", "wider=0,0,0,1,1,1"), "bad_option"),
+        (("--contributes", "wide,wide"), "bad_layer"),
+        (("--contributes", "wide", "--inside", "wide=0,0,0,1,1,1", "--inside", "wide=2,0,0,3,1,1"), "bad_option"),
     ):
         assert f"[{kind}]" in cairn(*assign, *options, folder=tmp_path, code=3 if kind == "no_map" else 1)
     cairn(*assign, "--none", folder=tmp_path)
     assert "(none" in cairn("map", "layer", "assigned", server.map_url, folder=tmp_path)
 
+    # Without a link it is the layer of the robot's folder; of several folders none is guessed.
+    server.stop()
+    assert "3 folders of mole are here" in replayed("--assigned", "--again", code=5)
+    said = replayed("--assigned", "--again", "--state", "cairn-mole.wider")
+    assert f"{server.map_url}.wider: no link to it" in said
 
-def test_what_a_robot_mapped_is_taken_out_of_all_layers_by_one_command(server: LiveServer, tmp_path: Path) -> None:
+
+def test_what_a_robot_mapped_is_taken_out_of_all_layers_by_one_command(
+    server: LiveServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     cairn("map", "layer", "add", server.map_url, "fine", "--voxel", "0.01", folder=tmp_path)
     cairn("map", "layer", "add", server.map_url, "wide", "--voxel", "0.2", folder=tmp_path)
     urls = {"evidence": server.map_url, "fine": f"{server.map_url}.fine"}
@@ -225,8 +245,20 @@ def test_what_a_robot_mapped_is_taken_out_of_all_layers_by_one_command(server: L
     assert "bad_option" in cairn(
         *retract, "--commit", "mole.0011223344556677.0", "--all-layers", folder=tmp_path, code=1
     )
+    # A receipt is printed when its layer is done, whatever becomes of the next; the same command goes on there.
+    ask = MapApi.retract
+
+    def broken(api: MapApi, name: str, request: Retract) -> Retracted:
+        if name == f"{MAP}.fine":
+            raise UnreachableError("no_link", "the link broke")
+        return ask(api, name, request)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(MapApi, "retract", broken)
+        assert main([*retract, "--robot", "mole", "--all-layers"]) == 5
+    assert f"takes out 1 commits of {MAP}:\n  mole." in capsys.readouterr().out
     said = cairn(*retract, "--robot", "mole", "--all-layers", folder=tmp_path)
-    assert said.count("takes out 1 commits of") == 2
+    assert said.count(f"takes out 1 commits of {MAP}.fine:") == said.count("takes out") == 1
     again = cairn(*retract, "--robot", "mole", "--all-layers", folder=tmp_path, code=3)
     assert "nothing_to_retract" in again
     wait_until(lambda: all(len(open_map(url).voxels_in()) == 1 for url in urls.values()))

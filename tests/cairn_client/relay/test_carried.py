@@ -7,7 +7,8 @@ import pytest
 from tests.fixtures.client.made import MAP
 from tests.fixtures.server.pushes import pushed
 
-from cairn_client.relay.carried_commits import COMING, CarriedCommits
+from cairn_client.relay.carried_commits import CarriedCommits
+from cairn_client.replica.durable_file import COMING
 from cairn_map.commits.ids import Author, CommitId, RobotName
 from cairn_map.commits.signature import TEXT_MAX, SigningKey, signatures_to_text
 from cairn_map.errors import BadInputError, ConflictError, DamagedDataError, NotFoundError, UnreachableError

@@ -1,22 +1,26 @@
 """A robot on several layers: each gets its scans at its resolution, one key vouches for all, the finest answers."""
 
+import threading
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from tests.fixtures.client.made import GEOMETRY, MAP
 from tests.fixtures.client.robot_program import INTEGRATOR, RIG, scan_of
 from tests.fixtures.server.access import ADMIN, ENROLLER
-from tests.fixtures.server.live import Live, until
+from tests.fixtures.server.live import Live, free_port, until
 
-from cairn_client.robot.layered_robot import LayeredRobot
+from cairn_calib.rig.rig import Rig
+from cairn_client.robot.layered_robot import ASSIGNMENT_FILE, LayeredRobot
 from cairn_client.robot.robot import Robot
 from cairn_fusion.mapping.integrate import integrate_scan
 from cairn_map.epochs.history_map import HistoryMap
 from cairn_map.epochs.layer import EVIDENCE, MapLayer
-from cairn_map.errors import BadInputError, DeniedError, NotFoundError
+from cairn_map.errors import BadInputError, DeniedError, NotFoundError, UnreachableError
 from cairn_map.evidence.grid import Geometry
 from cairn_map.wire.layer_messages import AddLayer, Assignment, MappedLayer
 from cairn_map.wire.messages import CreateMap
@@ -121,11 +125,11 @@ def assign(live: Live, *contributes: str | MappedLayer, fetches: tuple[str, ...]
     live.service.sync.layers.assign(live.service.store.map(MAP), "mole", assignment, by=ADMIN_FILE)
 
 
-def followed(live: Live, folder: Path) -> LayeredRobot:
+def followed(live: Live, folder: Path, *, token: str | None = ENROLLER) -> LayeredRobot:
     """A robot that leaves its layers to operators."""
     standard = dict.fromkeys(GRIDS, INTEGRATOR)
     return LayeredRobot(
-        RIG, url_of(live), directory=folder / "mole", name="mole", token=ENROLLER, integrators=standard, stay=True
+        RIG, url_of(live), directory=folder / "mole", name="mole", token=token, integrators=standard, stay=True
     )
 
 
@@ -144,7 +148,13 @@ def test_operators_assign_layers_and_the_robot_takes_them_with_its_next_round(li
         mole.sync()
         assert (mole.contributes, {*mole.robots}) == (("fine", "wide"), {"fine", "wide"})
         mole.observe(scan_of(3))
-        assert mole.commit().keys() == {"fine", "wide"}
+        # What was open in the layer that it left was committed then, and comes to the caller with the next commit.
+        made_now = mole.commit()
+        assert made_now.keys() == {"fine", "wide", EVIDENCE}
+        assert mole.commit() == {}
+        with pytest.raises(BadInputError, match="maps into") as refused:
+            mole.amend({EVIDENCE: made_now[EVIDENCE]}, T_map_observed=np.eye(4))
+        assert refused.value.kind == "bad_layer"
         mole.sync(until_folded=True)
         live.service.sync.layers.unassign(live.service.store.map(MAP), "mole", by=ADMIN_FILE)
         mole.sync()  # nothing new: it stays as it is
@@ -174,14 +184,97 @@ def test_a_robot_switches_layers_by_place(live: Live, tmp_path: Path) -> None:
             mole.observe(scan_of(1), into=["far"])
 
 
-def test_layers_that_are_assigned_while_it_syncs_in_the_background_are_opened(live: Live, tmp_path: Path) -> None:
+def test_layers_that_are_assigned_while_it_syncs_in_the_background_are_opened_there(
+    live: Live, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened_by: dict[str, threading.Thread] = {}
+
+    class Noted(Robot):
+        def __init__(self, rig: Rig | None, map_url: str, **options: Any) -> None:
+            opened_by[map_url] = threading.current_thread()
+            super().__init__(rig, map_url, **options)
+
+    monkeypatch.setattr("cairn_client.robot.layered_robot.Robot", Noted)
     assign(live, EVIDENCE)
     with followed(live, tmp_path) as mole:
         mole.start_sync(every_s=0.05)
-        assign(live, "fine")
-        until(lambda: (mole.commit(), mole.contributes)[1] == ("fine",), "it maps into the other layer")
         mole.observe(scan_of(1))
-        assert mole.commit().keys() == {"fine"}
+        assign(live, "fine")
+        until(lambda: (mole.snapshot(), {*mole.robots})[1] == {"fine"}, "it maps into the other layer")
+        mole.observe(scan_of(2))
+        assert mole.commit().keys() == {"fine", EVIDENCE}
+    here = threading.current_thread()
+    assert [opened_by[url_of(live, layer)] is here for layer in (EVIDENCE, "fine")] == [True, False]
+
+
+def test_a_layer_that_is_left_and_joined_again_loses_no_commit_to_its_caller(live: Live, tmp_path: Path) -> None:
+    assign(live, EVIDENCE)
+    with followed(live, tmp_path) as mole:
+        for seed, layer in ((1, "fine"), (2, EVIDENCE)):
+            mole.observe(scan_of(seed))
+            assign(live, layer)
+            mole.sync()
+        first = mole.observe(scan_of(3))
+        second = mole.commit()
+        assert (first.keys(), second.keys()) == ({EVIDENCE}, {EVIDENCE, "fine"})
+        assert first[EVIDENCE].id.n < second[EVIDENCE].id.n
+
+
+def test_a_new_layer_is_let_in_where_nothing_waits_in_the_one_that_is_left(live: Live, tmp_path: Path) -> None:
+    assign(live, EVIDENCE)
+    with followed(live, tmp_path) as mole:
+        mole.sync()
+        assign(live, "fine")
+        assert {*mole.sync()} == {"fine"}
+    # And where that one is not open at all.
+    assign(live, "wide")
+    with followed(live, tmp_path) as mole:
+        assert {*mole.sync()} == {"wide"}
+
+
+def test_a_layer_that_refuses_the_robot_stops_no_other(live: Live, tmp_path: Path) -> None:
+    assign(live, EVIDENCE, fetches=("wide",))
+    with followed(live, tmp_path) as mole:
+        mole.sync()
+    # By its own token of the map it asks for its layers and for the grid of a new one, which it may not register on.
+    assign(live, "fine", EVIDENCE)
+    with followed(live, tmp_path, token=None) as mole:
+        assert mole.contributes == ("fine", EVIDENCE)
+        mole.observe(scan_of(1))
+        assert mole.commit().keys() == {"fine", EVIDENCE}
+        with pytest.raises(DeniedError):
+            mole.sync()
+        assert {layer: robot.waiting for layer, robot in mole.robots.items()} == {"fine": 1, EVIDENCE: 0}
+    # Its token of a layer does not count on another one: that is opened when it can be.
+    assign(live, "wide")
+    with followed(live, tmp_path) as mole:
+        mole.sync()
+    (tmp_path / "mole" / EVIDENCE).rename(tmp_path / "elsewhere")
+    (tmp_path / "mole" / "fine").rename(tmp_path / "elsewhere too")
+    assign(live, "wide", EVIDENCE)
+    with followed(live, tmp_path, token=None) as mole:
+        mole.observe(scan_of(2))
+        assert mole.commit().keys() == {"wide"}
+        assert {*mole.sync()} == {"wide"}
+    with followed(live, tmp_path) as mole:
+        assert mole.contributes == ("wide", EVIDENCE)
+
+
+def test_a_start_without_a_link_opens_the_layers_that_are_known(live: Live, tmp_path: Path) -> None:
+    assign(live, EVIDENCE)
+    with followed(live, tmp_path) as mole:
+        mole.sync()
+    with followed(live, tmp_path, token="another map's") as mole:
+        assert mole.contributes == (EVIDENCE,)
+    known = tmp_path / "mole" / ASSIGNMENT_FILE
+    for layers, refusal in ((("fine", EVIDENCE), None), (("fine",), UnreachableError)):
+        known.write_text(Assignment(contributes=tuple(MappedLayer(layer=each) for each in layers)).model_dump_json())
+        url = f"http://127.0.0.1:{free_port('127.0.0.1')}/maps/{MAP}"
+        with (
+            pytest.raises(refusal) if refusal else nullcontext(),
+            LayeredRobot(RIG, url, directory=tmp_path / "mole", name="mole") as mole,
+        ):
+            assert (mole.contributes, mole.assignment.layers) == ((EVIDENCE,), layers)
 
 
 def test_a_measurement_is_amended_and_taken_back_in_all_its_layers(live: Live, tmp_path: Path) -> None:

@@ -256,7 +256,9 @@ def test_operators_assign_layers_to_robots_who_see_it_on_the_map_and_on_each_lay
     assert Assignment.model_validate(asked[0]["assignment"]) == Assignment.model_validate(assignment)
     listed = guarded.http.get(path, headers=bearer(ENROLLER)).json()
     assert [each["robot"] for each in listed] == ["mole", "wren"]
-    # Taken back, once.
+    # Taken back, once, on the map.
+    taken = guarded.http.delete(f"/maps/{fine.name}/assignments/mole", headers=bearer(ADMIN))
+    assert refused(taken) == (400, "layer_of_map")
     for expected in (204, 404):
         assert guarded.http.delete(f"{path}/mole", headers=bearer(operator)).status_code == expected
     assert [each["robot"] for each in guarded.http.get(path, headers=bearer(operator)).json()] == ["wren"]

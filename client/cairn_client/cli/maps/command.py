@@ -32,6 +32,7 @@ import argparse
 import json
 import re
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 from cairn_calib.rig.rig import load_rig
@@ -193,20 +194,19 @@ def _retract(args: argparse.Namespace) -> int:
         **{f"{part}_s": seconds_of(getattr(args, part)) for part in TIMES},
     )
     with api:
-        done = _retracted(api, name, request, all_layers=args.all_layers)
-    for layer, each in done.items():
-        where = f" of {layer}" if args.all_layers else ""
-        if each.id is None:
-            say(f"would take out {len(each.commits)} commits{where} (nothing was done):")
-        else:
-            say(f"{each.id} takes out {len(each.commits)} commits{where}:")
-        for commit in each.commits:
-            say(f"  {commit}")
+        for layer, each in _retracts(api, name, request, all_layers=args.all_layers):
+            where = f" of {layer}" if args.all_layers else ""
+            if each.id is None:
+                say(f"would take out {len(each.commits)} commits{where} (nothing was done):")
+            else:
+                say(f"{each.id} takes out {len(each.commits)} commits{where}:")
+            for commit in each.commits:
+                say(f"  {commit}")
     return 0
 
 
-def _retracted(api: MapApi, name: str, request: Retract, *, all_layers: bool) -> dict[str, Retracted]:
-    """Retracts by the name of the map, or of each layer that has such commits.
+def _retracts(api: MapApi, name: str, request: Retract, *, all_layers: bool) -> Iterator[tuple[str, Retracted]]:
+    """Retracts with the name of the map, or of each layer that has such commits, each as soon as it is done.
 
     Each layer is a log of its own, so a retract is one commit in each; after a failure the same command goes on.
 
@@ -215,21 +215,23 @@ def _retracted(api: MapApi, name: str, request: Retract, *, all_layers: bool) ->
         BadInputError: kind `bad_option`: commits of all layers are named by what they have in common, not one by one.
     """
     if not all_layers:
-        return {name: api.retract(name, request)}
+        yield name, api.retract(name, request)
+        return
     if request.commits:
         raise BadInputError("bad_option", "--commit names a commit of one layer: give the layer's URL, MAP.LAYER")
-    done: dict[str, Retracted] = {}
-    nothing: NotFoundError | None = None
+    is_done, nothing = False, None
     for layer in layers_of(api, name).values():
         try:
-            done[layer] = api.retract(layer, request)
+            retracted = api.retract(layer, request)
         except NotFoundError as exc:
             if exc.kind != "nothing_to_retract":
                 raise
             nothing = exc
-    if not done and nothing is not None:
+        else:
+            is_done = True
+            yield layer, retracted
+    if not is_done and nothing is not None:
         raise nothing
-    return done
 
 
 def rig_digest(text: str) -> str:

@@ -223,7 +223,8 @@ def _write_finest(layers: LayeredSnapshot, args: argparse.Namespace) -> None:
             continue
         found = layers.occupied_in() if form == "ply" else layers.voxels_in()
         lengths = [len(voxels) for voxels in found.values()]
-        if form == "npz" and not sum(lengths):
+        # No occupied voxels are a file without points, no evidence is none: as of a map of one layer.
+        if not sum(lengths) and (form == "npz" or not any(map(len, layers.voxels_in().values()))):
             raise NotFoundError("empty_map", f"no layer of {args.map} holds anything yet")
         edges_m = np.repeat([layers[name].geometry.voxel_edge_m for name in found], lengths)
         voxels = joined_layers(list(found.values()))

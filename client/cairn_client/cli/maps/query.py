@@ -212,7 +212,7 @@ def _points(snapshot: MapSnapshot, args: argparse.Namespace) -> tuple[Any, list[
 
 
 def _points_of_layers(layers: LayeredSnapshot, args: argparse.Namespace) -> tuple[Any, list[str]]:
-    """`_points`, of each point in the finest layer that knows it."""
+    """State and readings of points, each in the finest layer that knows it; as JSON and as lines."""
     # What no layer knows is said of the one that the map began with.
     of_layer: dict[str, list[int]] = {name: [] for name in layers.names}
     for n, name in enumerate(layers.names_at(args.points)):
@@ -236,7 +236,7 @@ def _ray(snapshot: MapSnapshot, args: argparse.Namespace) -> tuple[Any, list[str
 
 
 def _ray_of_layers(layers: LayeredSnapshot, args: argparse.Namespace) -> tuple[Any, list[str]]:
-    """`_ray`, through each place as the finest layer that knows it has it."""
+    """End of a ray through each place as the finest layer that knows it has it; as JSON and as a line."""
     ends = layers.cast_rays([args.origin], [args.direction], max_range_m=args.range)
     return _end_of_ray(ends, args, {"layer": ends.names[0]})
 
@@ -260,7 +260,7 @@ def _nearest(snapshot: MapSnapshot, args: argparse.Namespace) -> tuple[Any, list
 
 
 def _nearest_of_layers(layers: LayeredSnapshot, args: argparse.Namespace) -> tuple[Any, list[str]]:
-    """`_nearest`, of the occupied voxels of all layers."""
+    """Nearest occupied voxel of all layers to each point; as JSON and as lines."""
     nearest = layers.nearest_occupied(args.points, radius_m=args.radius)
     found, lines = _nearest_of(nearest, args, "occupied")
     found = [{**each, "layer": name} for each, name in zip(found, nearest.names, strict=True)]
@@ -296,7 +296,7 @@ def _hottest(snapshot: MapSnapshot, args: argparse.Namespace) -> tuple[Any, list
 
 
 def _hottest_of_server(args: argparse.Namespace) -> tuple[Any, list[str]]:
-    """`_hottest`, of a map of which the server reads the hottest cells alone."""
+    """Hottest voxels of a server's map, of which it reads the hottest cells alone; as JSON and as lines."""
     if not 1 <= args.count <= HOTTEST_MAX:
         raise BadInputError("bad_range", f"a server names 1 to {HOTTEST_MAX} voxels, not {args.count}")
     api, name = api_of(args.map, args.token)

@@ -146,6 +146,7 @@ def list_assignments(
 @router.put(
     "/maps/{name}/assignments/{robot}",
     status_code=204,
+    responses=problems(409),
     openapi_extra=json_body(
         Assignment,
         example={

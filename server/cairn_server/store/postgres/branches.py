@@ -7,6 +7,7 @@ from typing import Any
 from cairn_map.commits.cursor import ENTRY_FOLD, Cursor, cursor_from_text
 from cairn_map.commits.ids import Author, Incarnation, RobotName
 from cairn_map.errors import NotFoundError
+from cairn_server.map_refusals import check_assignment_count
 from cairn_server.store.admission import Grounds
 from cairn_server.store.branch_signs import LastSeen
 from cairn_server.store.postgres.connections import Connection, Connections, first, rows
@@ -130,15 +131,19 @@ class PgBranches:
             lock_head(connection, row)
             connection.execute("DELETE FROM assignment WHERE map = %s AND robot = %s", (row.number, robot))
             if assignment is not None:
+                ((others,),) = rows(connection, "SELECT count(*) FROM assignment WHERE map = %s", (row.number,))
+                check_assignment_count(row.name, others)
                 connection.execute("INSERT INTO assignment VALUES (%s, %s, %s)", (row.number, robot, assignment))
 
         self._connections.run(job)
 
-    def assignments(self, row: MapRow) -> dict[str, str]:
-        """Assignments of a map, by robot."""
-        query = "SELECT robot, assignment FROM assignment WHERE map = %s ORDER BY robot"
+    def assignments(self, row: MapRow, robot: str | None = None) -> dict[str, str]:
+        """Assignments of a map by robot: of all, or (one at most) of a robot."""
+        query = "SELECT robot, assignment FROM assignment WHERE map = %s"
         with self._connections.lent() as connection:
-            return dict(rows(connection, query, (row.number,)))
+            if robot is None:
+                return dict(rows(connection, f"{query} ORDER BY robot", (row.number,)))
+            return dict(rows(connection, f"{query} AND robot = %s", (row.number, robot)))
 
     def flush(self) -> None:
         """Return when all notes that were made are written."""

@@ -8,6 +8,7 @@ import apsw
 from cairn_map.commits.cursor import ENTRY_FOLD, cursor_from_text
 from cairn_map.commits.ids import Author
 from cairn_map.errors import UnreachableError
+from cairn_server.map_refusals import check_assignment_count
 from cairn_server.store.sqlite.readers import Readers
 from cairn_server.store.sqlite.retention import check_lives
 from cairn_server.store.sqlite.schema import MAPS
@@ -66,15 +67,19 @@ class SqliteBranchNotes:
             check_lives(connection, row.number)
             connection.execute("DELETE FROM assignment WHERE map = ? AND robot = ?", (row.number, robot))
             if assignment is not None:
+                ((others,),) = rows(connection, "SELECT count(*) FROM assignment WHERE map = ?", (row.number,))
+                check_assignment_count(row.name, others)
                 connection.execute("INSERT INTO assignment VALUES (?, ?, ?)", (row.number, robot, assignment))
 
         self._writer.run(job)
 
-    def assignments(self, row: MapRow) -> dict[str, str]:
-        """Assignments of a map, by robot."""
-        query = "SELECT robot, assignment FROM assignment WHERE map = ? ORDER BY robot"
+    def assignments(self, row: MapRow, robot: str | None = None) -> dict[str, str]:
+        """Assignments of a map by robot: of all, or (one at most) of a robot."""
+        query = "SELECT robot, assignment FROM assignment WHERE map = ?"
         with self._readers.reading() as reader:
-            return dict(rows(reader, query, (row.number,)))
+            if robot is None:
+                return dict(rows(reader, f"{query} ORDER BY robot", (row.number,)))
+            return dict(rows(reader, f"{query} AND robot = ?", (row.number, robot)))
 
 
 def stored_branches(reader: apsw.Connection, row: MapRow, name: str | None = None) -> list[Branch]:
