@@ -19,6 +19,7 @@ from tests.console.browsing import VIEW, browser, skip_without_page, tab
 from tests.console.casting import occupied, picks_met_first
 from tests.console.room import LOOPBACK, Room
 from tests.fixtures.commands import cairn, record_room, served, wait_for_fold
+from tests.fixtures.forked_command import ForkedCommand, start_command
 from tests.fixtures.pages import DOCS, commands_of, programs_of
 from tests.fixtures.server.live import free_port
 
@@ -40,6 +41,14 @@ def typed(*arguments: object, folder: Path, code: int = 0) -> str:
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=COMMAND_S, check=False)
     assert done.returncode == code, done.stdout + done.stderr
     return done.stdout if code == 0 else done.stderr
+
+
+def test_a_command_is_forked_unless_its_environment_counts_at_its_start(tmp_path: Path) -> None:
+    changed = os.environ | {"PYTHONHASHSEED": "7"}
+    for env, kind in ((os.environ, ForkedCommand), (changed, subprocess.Popen)):
+        process = start_command(["--version"], env=env, stderr=2, folder=tmp_path)
+        said, _ = process.communicate(timeout=COMMAND_S)
+        assert isinstance(process, kind) and process.returncode == 0 and said.startswith("cairn ")
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,8 @@ Topics, all in the frame `map` (--frame), lengths in metres, temperatures in deg
     /cairn/marks                visualization_msgs/MarkerArray: what robots and people marked
     /cairn/octomap              octomap_msgs/Octomap: occupied and free space, once, with --octomap
     /tf                         tf2_msgs/TFMessage: robots that report where they are, each the frame of its name
-    /cairn/robots/NAME/path     nav_msgs/Path: the way of one since publishing began, every 3 s; its name has _ for -
+    /cairn/robots/NAME/path     nav_msgs/Path: the way of one since publishing began, at most every 3 s; its name has
+                                _ for - and _U for _
 
 The storey of /map is that of --ground; without it the largest one, chosen again after each change, but left only for
 one with twice its free area. A viewer that joins late gets the newest message of each topic at once.

@@ -8,6 +8,7 @@ from cairn_client.replica.replica import Replica
 from cairn_client.replica.replica_state import ReplicaState
 from cairn_client.replica.replica_store import FILE_NAME, ReplicaStore
 from cairn_map.commits.ids import robot_name
+from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import BadInputError
 
 
@@ -32,6 +33,14 @@ def robot_of(folder: Path) -> str | None:
         return None
     with closing(ReplicaStore(folder)) as store:
         return ReplicaState(store).robot
+
+
+def layer_of(folder: Path) -> MapLayer | None:
+    """Layer that a folder's map has; None: no map yet. Raises: ConflictError: a robot has it open."""
+    if not is_state_folder(folder):
+        return None
+    with closing(ReplicaStore(folder)) as store:
+        return ReplicaState(store).layer
 
 
 def layer_folders(folder: Path) -> list[Path]:

@@ -140,14 +140,15 @@ class BridgeLinks:
             BadInputError: no bridge is there, see `connect_bridge`.
         """
         stack = ExitStack()
-        link = connect_bridge(stack, self._url, self._checks)
         try:
+            link = connect_bridge(stack, self._url, self._checks)
             greet(link)
-        except BadInputError:
+            thread = threading.Thread(target=self._run, args=(stack, link), name=self._name, daemon=True)
+            thread.start()
+        except BaseException:  # Ctrl-C, too: no thread is there to end the link
             stack.close()
             raise
-        self._thread = threading.Thread(target=self._run, args=(stack, link), name=self._name, daemon=True)
-        self._thread.start()
+        self._thread = thread
 
     def stop(self) -> None:
         """End the last link."""

@@ -1,9 +1,11 @@
 """URLs of a robot's network: SCHEME://HOST:PORT, perhaps with ?domain=N, the ROS_DOMAIN_ID."""
 
+import re
 from urllib.parse import SplitResult, parse_qsl, urlsplit
 
 DOMAIN_MAX = 232
 """Largest ROS_DOMAIN_ID."""
+DOMAIN = re.compile(r"0*[0-9]{1,3}")
 
 
 def url_parts(url: str, scheme: str) -> SplitResult | None:
@@ -21,10 +23,9 @@ def domain_of(query: str) -> int:
     """ROS_DOMAIN_ID of a URL's query, `domain=N`.
 
     Raises:
-        ValueError: it says something else, or a number that is none.
+        ValueError: it says something else, says it twice, or a number that is none.
     """
-    fields = dict(parse_qsl(query, strict_parsing=True))
-    text = fields.pop("domain", "")
-    if fields or not (text.isascii() and text.isdigit() and int(text[:9]) <= DOMAIN_MAX):
-        raise ValueError(f"{query!r:.100} is no domain=N")
-    return int(text[:9])
+    match parse_qsl(query, strict_parsing=True):
+        case [("domain", text)] if DOMAIN.fullmatch(text) and int(text) <= DOMAIN_MAX:
+            return int(text)
+    raise ValueError(f"{query!r:.100} is no domain=N")

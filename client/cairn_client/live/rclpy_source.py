@@ -13,6 +13,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from contextlib import ExitStack, closing
 from typing import Any
 
 from cairn_client.links.link_url import domain_of
@@ -79,21 +80,20 @@ class RclpySource(LiveSource):
 
     def _receive(self, node: Ros2Node) -> None:
         """Receive until `close`; from here on this thread alone uses rclpy."""
-        executor = importlib.import_module("rclpy.executors").SingleThreadedExecutor(context=node.context)
-        executor.add_node(node.node)
-        look_s = 0.0
         try:
-            while not self._closing.is_set():
-                if time.monotonic() >= look_s:
-                    self._look(node)
-                    look_s = time.monotonic() + LOOK_S
-                executor.spin_once(timeout_sec=SPIN_S)
+            with closing(node), ExitStack() as open_parts:
+                executor = importlib.import_module("rclpy.executors").SingleThreadedExecutor(context=node.context)
+                open_parts.callback(executor.shutdown)
+                executor.add_node(node.node)
+                look_s = 0.0
+                while not self._closing.is_set():
+                    if time.monotonic() >= look_s:
+                        self._look(node)
+                        look_s = time.monotonic() + LOOK_S
+                    executor.spin_once(timeout_sec=SPIN_S)
         except Exception:
             log.exception("ROS 2 has ended")
             self._note_link(is_there=False)
-        finally:
-            executor.shutdown()
-            node.close()
 
     def _look(self, node: Ros2Node) -> None:
         """Take over which topics there are, and subscribe to those that are wanted."""

@@ -262,8 +262,9 @@ class MapPublisher:
 
 
 def path_topic(robot: str) -> str:
-    """Topic of a robot's way: ROS takes no name with a hyphen, nor one that begins with a digit."""
-    name = robot.replace("-", "_")
+    """Topic of a robot's way, of no other robot: ROS takes no name with a hyphen, nor one that begins with a digit."""
+    # Names have no capitals, so that `_U` is never one's own.
+    name = robot.replace("_", "_U").replace("-", "_")
     return f"/cairn/robots/{f'_{name}' if name[0].isdigit() else name}/path"
 
 

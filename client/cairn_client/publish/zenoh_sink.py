@@ -41,6 +41,8 @@ ATTACHMENT = struct.Struct("<qqB16s")
 """Attachment of rmw_zenoh's messages: number from 1 on, nanoseconds, length of the publisher's id, and the id."""
 HEARTBEAT_S = 0.5
 """Time after which a node hears of a message that it missed, and asks for it."""
+AGAIN_S = 2.0
+"""Pause after an error of zenoh."""
 
 
 @dataclass(slots=True)
@@ -107,15 +109,18 @@ class ZenohSink:
             self._has_humble.set()
 
     def _send_all(self) -> None:
-        """Send until `__exit__`, and all again after the link was lost or a node of Humble came."""
+        """Send until `__exit__`, and all again after the link was lost or a node of Humble came.
+
+        What fails is tried again after a pause; from `__exit__` on all that waits is tried once more.
+        """
         was_linked, had_humble = True, False
         while True:
             message = self._newest.take(within_s=LOOK_S)
             try:
                 if self._has_humble.is_set() and not had_humble:
-                    had_humble = True
                     self._undeclare()
                     self._newest.put_again()
+                    had_humble = True
                 if message is not None:
                     self._put(message)
                 elif self._closing.is_set():
@@ -127,6 +132,10 @@ class ZenohSink:
                 was_linked = is_there
             except zenoh.ZError as exc:
                 log.warning("%s: %s", self._router.url, exc)
+                if not self._closing.is_set():
+                    self._closing.wait(AGAIN_S)
+                    if message is not None:
+                        self._newest.put_again(message.topic)
 
     def _put(self, message: MapMessage) -> None:
         publisher = self._publishers.get(message.topic)
@@ -158,9 +167,9 @@ class ZenohSink:
         return _Publisher(declared, self._session.liveliness().declare_token(token), uuid.uuid4().bytes)
 
     def _undeclare(self) -> None:
-        """Withdraw all publishers."""
-        for publisher in self._publishers.values():
+        """Withdraw all publishers; after an error those that are left."""
+        while self._publishers:
+            _, publisher = self._publishers.popitem()
             publisher.token.undeclare()
             for declared in publisher.declared:
                 declared.undeclare()
-        self._publishers.clear()

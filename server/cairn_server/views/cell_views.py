@@ -50,7 +50,7 @@ FILE_VOXELS_MAX = 1 << 20
 """Known voxels of a cell that is made into an NPZ or PLY file: some 330 bytes of memory each."""
 TOTAL = "total"
 """Form of a cell of a map with epochs: the sum of its rows, as a cell of version 1."""
-LOOKS = 2
+LOOKS = 3
 """Number of the way in which views for a page are made: another one makes all their ETags others."""
 BUNDLE_MEDIA_TYPE = "application/vnd.cairn.views"
 BUNDLE_CELLS_MAX = 10_000
@@ -142,11 +142,17 @@ def shown_reading(row: MapRow, stored: CellRow) -> Evidence:
 
 def view_of_reading(row: MapRow, stored: CellRow, evidence: Evidence, depth: int) -> bytes:
     """View for a page of what was read of a stored cell, at an octree depth."""
+    shown, style = page_reading(row, evidence, depth)
+    return encode_view(stored.key, shown, row.geometry, row.sensor_model, style=style)
+
+
+def page_reading(row: MapRow, evidence: Evidence, depth: int) -> tuple[Evidence, ViewStyle]:
+    """Evidence and style of the view for a page of what was read of a cell: of a level its surfaces, with heights."""
     style = ViewStyle(depth, is_for_page=True)
-    if row.geometry.is_flat:
-        evidence = shown_surfaces(evidence, row.geometry, row.sensor_model)
-        style = replace(style, temperature_step_k=HEIGHT_RESOLUTION_M)
-    return encode_view(stored.key, evidence, row.geometry, row.sensor_model, style=style)
+    if not row.geometry.is_flat:
+        return evidence, style
+    shown = shown_surfaces(evidence, row.geometry, row.sensor_model)
+    return shown, replace(style, temperature_step_k=HEIGHT_RESOLUTION_M)
 
 
 class ViewCache:

@@ -3,7 +3,7 @@
     cell as it is          -->  its view
     cell less the commits  -->  its view      gone, appeared, warmer, colder, otherwise: exactly what differs
 
-Views are compared, not counts: a voxel of which hits go and which looks the same is no change to who looks.
+Views for a page are compared, not counts: a voxel of which hits go and which looks the same is no change to who looks.
 """
 
 import time
@@ -20,7 +20,7 @@ from cairn_map.epochs.cell_history import CellHistory, unmerged
 from cairn_map.epochs.present import shown_evidence
 from cairn_map.errors import BadInputError, ConflictError
 from cairn_map.evidence.grid import CellKey, cell_of_key, centres_of_voxels
-from cairn_map.evidence.view import View, ViewStyle, view_of
+from cairn_map.evidence.view import View, view_of
 from cairn_map.kernels.morton_kernels import deinterleave
 from cairn_map.wire.change_messages import CellVoxels, RetractChangeCounts, RetractChanges
 from cairn_map.wire.messages import Retract
@@ -31,12 +31,13 @@ from cairn_server.folding.cells_at_rest import sound_cell, stored_history, sum_o
 from cairn_server.store.store import Snapshot, Store
 from cairn_server.store.store_rows import Contribution, MapRow
 from cairn_server.sync.retracting import targets_of
+from cairn_server.views.cell_views import page_reading
 from cairn_server.views.map_changes import CHANGED_MAX, SEARCH_S
 from cairn_server.views.readings import PAST_ENTRIES_MAX
 
 WAYS = ("gone", "appeared", "warmer", "colder", "otherwise")
 NO_HEAT = np.iinfo(np.int64).min
-"""Temperature of a node that has none."""
+"""Temperature, or height of a level's surface, of a node that has none."""
 NAMES_AT_ONCE = 256
 """Commits that are looked up in the store between two looks at the time."""
 
@@ -145,7 +146,7 @@ def _changes_of(
         whole = stored_history(stored, row.layer)
         now, left = _view(whole, row), unmerged(whole, part, row.geometry)
         del whole, part
-        return _differences(now, _view(left, row))
+        return _differences(now, _view(left, row), has_heights=row.geometry.is_flat)
 
 
 def _entries_of(snapshot: Snapshot, key: CellKey, commits: frozenset[CommitId]) -> list[Contribution]:
@@ -165,16 +166,18 @@ def _while_wanted(entries: list[Contribution], bound: _Bound) -> Iterator[Contri
 
 def _view(history: CellHistory, row: MapRow) -> View:
     evidence = shown_evidence(history, row.layer, row.sensor_model)
-    return view_of(evidence, row.geometry, row.sensor_model, ViewStyle(depth=row.geometry.depth))
+    shown, style = page_reading(row, evidence, row.geometry.depth)
+    del evidence
+    return view_of(shown, row.geometry, row.sensor_model, style)
 
 
-def _differences(now: View, then: View) -> dict[str, Ints]:
-    """Nodes that are in one of two views alone, or look different in them."""
+def _differences(now: View, then: View, *, has_heights: bool) -> dict[str, Ints]:
+    """Nodes that are in one of two views alone, or look different in them; another height is no other warmth."""
     mine, theirs = now.nodes.astype(np.int64), then.nodes.astype(np.int64)
     both, rows, other_rows = np.intersect1d(mine, theirs, assume_unique=True, return_indices=True)
     before, after = _heats(now)[rows], _heats(then)[other_rows]
-    has_both = (before != NO_HEAT) & (after != NO_HEAT)
-    warmer, colder = has_both & (after > before), has_both & (after < before)
+    are_warm = (before != NO_HEAT) & (after != NO_HEAT) & (not has_heights)
+    warmer, colder = are_warm & (after > before), are_warm & (after < before)
     is_other = (_looks(now)[rows] != _looks(then)[other_rows]).any(axis=1) | (before != after)
     return {
         "gone": np.setdiff1d(mine, theirs, assume_unique=True),
@@ -186,7 +189,7 @@ def _differences(now: View, then: View) -> dict[str, Ints]:
 
 
 def _heats(view: View) -> Ints:
-    """(V,) mean temperatures of a view's nodes, in its steps; `NO_HEAT`: none."""
+    """(V,) mean temperatures, or heights of a level, of a view's nodes, in its steps; `NO_HEAT`: none."""
     heats = np.full(len(view), NO_HEAT, np.int64)
     if len(view.warm):
         heats[view.warm] = view.temperatures.reshape(len(view.warm), -1)[:, 0]

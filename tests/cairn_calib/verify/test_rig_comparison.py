@@ -89,7 +89,7 @@ def test_calibrations_with_the_stated_noise_agree_as_often_as_stated_and_no_more
         assert np.mean([each.score for each in found]) == pytest.approx(1.0, abs=0.3)
         measured = np.sqrt(np.mean([each.rms_px**2 for each in found]))
         assert measured == pytest.approx(float(found[0].expected_px or 0), rel=0.25)
-        assert sum(each.agrees is False for each in found) <= 2
+        assert sum(each.agrees is False for each in found) <= length(1, long=2)
 
 
 def test_half_the_noise_that_there_is_is_not_believed() -> None:

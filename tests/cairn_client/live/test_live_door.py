@@ -23,6 +23,7 @@ from tests.fixtures.fusion.live_drive import drive, labelled, latched
 from websockets.sync.server import ServerConnection, serve
 
 from cairn_client import main as cairn
+from cairn_client.cli.robots import live_run
 from cairn_client.http.api import MapApi
 from cairn_client.live.foxglove_source import FoxgloveSource
 from cairn_client.live.live_opening import OpenedLive, open_live, survey_live
@@ -294,7 +295,11 @@ def test_a_map_of_another_grid_is_refused(
 
 
 def test_labels_of_other_classes_than_the_layer_s_are_refused(
-    bridge: Bridge, server: LiveServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    bridge: Bridge,
+    server: LiveServer,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     classes = classes_channel(("wall", "table"))
     with MapApi(server.url) as api:
@@ -307,11 +312,12 @@ def test_labels_of_other_classes_than_the_layer_s_are_refused(
     said = refused(capsys, tmp_path, bridge.url, "--map", f"{server.map_url}.things", topics=topics)
     sender.join()
     assert "[unknown_class]" in said
-    # Without a link the folder of an earlier run knows them.
+    # Without a link the folder of an earlier run knows them; its robot is not even opened, which would leave the map.
     grid = geometry_for(voxel_edge_m=VOXEL_M, channels=(classes,))
     Robot(None, NOWHERE, directory=tmp_path / "mole", name="mole", geometry=grid, stay=True).close()
+    monkeypatch.setattr(live_run, "Robot", None)
     (tmp_path / "live.yaml").write_text(topics)
-    where = ["--map", NOWHERE, "--name", "mole", "--state", str(tmp_path / "mole"), "--stay"]
+    where = ["--map", NOWHERE, "--name", "mole", "--state", str(tmp_path / "mole")]
     with a_bridge() as second:
         second.offer_all(timed)
         sender = threading.Thread(target=send_when_subscribed, args=(second, timed))

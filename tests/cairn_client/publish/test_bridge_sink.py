@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from foxglove import Context
 from foxglove.websocket import Capability, Client, ClientChannel, ServerListener
-from tests.fixtures.client.live_server import WAIT_S
+from tests.fixtures.client.live_server import WAIT_S, wait_until
 from tests.fixtures.fusion.cdr_reader import read_message
-from tests.fixtures.server.live import free_port
+from tests.fixtures.server.live import free_port, is_free_port
 
 from cairn_client.cli.maps.command import main
 from cairn_client.publish.bridge_sink import REPEAT_S, BridgeSink
@@ -26,6 +26,7 @@ class Bridge(ServerListener):
     def __init__(self, port: int, capabilities: list[Capability]) -> None:
         self.came: queue.Queue[tuple[str, str, bytes]] = queue.Queue()
         self._channels: dict[int, ClientChannel] = {}
+        self._port = port
         self._server = foxglove.start_server(
             name="bridge", host="127.0.0.1", port=port, context=Context(), server_listener=self,
             capabilities=capabilities, supported_encodings=["cdr"],
@@ -42,7 +43,9 @@ class Bridge(ServerListener):
         return self.came.get(timeout=WAIT_S)
 
     def stop(self) -> None:
+        """End it; its port comes free a little later."""
         self._server.stop()
+        wait_until(lambda: is_free_port(self._port))
 
 
 @contextmanager

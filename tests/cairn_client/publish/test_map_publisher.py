@@ -1,6 +1,8 @@
 """Publisher of a followed map: what a robot says, a storey that grows, a link that breaks."""
 
+import re
 from collections.abc import Iterator
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,7 @@ from cairn_client.publish.followed_map import FollowedMap
 from cairn_client.publish.map_publisher import PATH_S, POSES_MAX, STEP_M, FloorChoice, MapPublisher, path_topic
 from cairn_fusion.ros.map_messages import MapMessage, definition_of
 from cairn_map.commits.commit import ScanPose
+from cairn_map.commits.ids import NAME
 from cairn_map.errors import NotFoundError, UnreachableError
 from cairn_map.evidence.evidence import Evidence, packed_evidence
 from cairn_map.evidence.grid import CellKey, cell_key
@@ -194,9 +197,18 @@ def test_a_long_path_keeps_its_begin_and_a_bounded_number_of_poses(published: Pu
     assert (places[0], places[-1]) == (0.0, 0.06 * (count - 1))
 
 
-@pytest.mark.parametrize(("robot", "name"), [("mole", "mole"), ("mole-2", "mole_2"), ("2nd", "_2nd")])
+@pytest.mark.parametrize(
+    ("robot", "name"), [("mole", "mole"), ("mole-2", "mole_2"), ("mole_2", "mole_U2"), ("2nd", "_2nd")]
+)
 def test_topics_of_robots_are_names_that_ros_takes(robot: str, name: str) -> None:
     assert path_topic(robot) == f"/cairn/robots/{name}/path"
+
+
+def test_no_two_robots_share_a_topic() -> None:
+    names = ["".join(letters) for count in range(1, 5) for letters in product("a2-_u", repeat=count)]
+    topics = [path_topic(name) for name in names if NAME.fullmatch(name)]
+    assert len(set(topics)) == len(topics)
+    assert all(re.fullmatch(r"/cairn/robots/[A-Za-z_][A-Za-z0-9_]*/path", topic) for topic in topics)
 
 
 def test_marks_are_published_as_they_come_and_go(published: Published) -> None:

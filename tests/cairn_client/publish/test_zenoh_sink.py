@@ -2,7 +2,7 @@
 
 import queue
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from zenoh import ext
 from cairn_client.cli.maps.command import main
 from cairn_client.links.zenoh_keys import publisher_of, publisher_token
 from cairn_client.live.live_doors import open_door
+from cairn_client.publish import zenoh_sink
 from cairn_client.publish.zenoh_sink import ZenohSink
 from cairn_fusion.ros.bag import Topic, Wire
 from cairn_fusion.ros.map_messages import GRID, MapMessage, grid_message
@@ -57,6 +58,12 @@ class Node:
             pass
 
 
+def declare_humble(robot: ZenohRobot) -> None:
+    """A node of Humble, which says no hash of the type that it subscribes to, shows itself."""
+    token = f"@ros2_lv/7/{robot.node.info.zid()}/0/9/MS/%/%/nav2/%map/{TYPE}/{HUMBLE}/:1:,1:,:,:,,"
+    robot.node.liveliness().declare_token(token)
+
+
 @pytest.fixture
 def robot() -> Iterator[ZenohRobot]:
     with a_zenoh_robot() as robot:
@@ -86,11 +93,61 @@ def test_nodes_of_humble_get_them_under_keys_without_hashes(robot: ZenohRobot) -
     with ZenohSink(robot.url) as sink:
         sink.send(grid(1))
         newer.newest(grid(1).data)
-        token = f"@ros2_lv/7/{robot.node.info.zid()}/0/9/MS/%/%/nav2/%map/{TYPE}/{HUMBLE}/:1:,1:,:,:,,"
-        robot.node.liveliness().declare_token(token)
+        declare_humble(robot)
         humble.newest(grid(1).data)
         sink.send(grid(2))
         humble.newest(grid(2).data)
+
+
+def failing_once(call: Callable[..., Any]) -> Callable[..., Any]:
+    """The call, of which the first fails as zenoh's do."""
+    errors = [zenoh.ZError("refused")]
+
+    def called(*given: Any, **named: Any) -> Any:
+        if errors:
+            raise errors.pop()
+        return call(*given, **named)
+
+    return called
+
+
+def test_a_message_that_zenoh_refused_is_sent_again(robot: ZenohRobot, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(zenoh_sink, "AGAIN_S", 0.0)
+    monkeypatch.setattr(ZenohSink, "_put", failing_once(ZenohSink._put))
+    with ZenohSink(robot.url) as sink:
+        sink.send(grid(1))
+        Node(robot, KEY).newest(grid(1).data)
+
+
+def test_a_refusal_at_the_end_keeps_nothing_else_from_being_sent(
+    robot: ZenohRobot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    put, came = ZenohSink._put, list[str]()
+
+    def noted(sink: ZenohSink, message: MapMessage) -> None:
+        came.append(message.topic)
+        if message.topic == "/map":
+            raise zenoh.ZError("refused")
+        put(sink, message)
+
+    monkeypatch.setattr(ZenohSink, "_put", noted)
+    with ZenohSink(robot.url) as sink:
+        for topic in ("/map", "/other"):
+            sink.send(grid(1)._replace(topic=topic))
+    assert set(came) == {"/map", "/other"} and not sink._thread.is_alive()
+
+
+def test_a_node_of_humble_gets_all_after_an_error_as_it_came(
+    robot: ZenohRobot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(zenoh_sink, "AGAIN_S", 0.0)
+    monkeypatch.setattr(ZenohSink, "_undeclare", failing_once(ZenohSink._undeclare))
+    humble, newer = Node(robot, KEY.replace(HASH, HUMBLE)), Node(robot, KEY)
+    with ZenohSink(robot.url) as sink:
+        sink.send(grid(1))
+        newer.newest(grid(1).data)
+        declare_humble(robot)
+        humble.newest(grid(1).data)
 
 
 def test_a_router_that_starts_again_gets_the_newest_of_each_topic(robot: ZenohRobot) -> None:

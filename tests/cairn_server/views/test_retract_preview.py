@@ -2,10 +2,12 @@
 
 import math
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from tests.fixtures.map.classed import classed_evidence
 from tests.fixtures.map.made import SMALL, random_evidence
 from tests.fixtures.server.epoch_pushes import pushed_in
 from tests.fixtures.server.live import Live
@@ -17,7 +19,8 @@ from cairn_map.epochs.epoch import Epoch
 from cairn_map.epochs.history_cell import HistoryCell
 from cairn_map.epochs.layer import MapLayer
 from cairn_map.errors import BadInputError, UnreachableError
-from cairn_map.evidence.grid import CellKey, centres_of_voxels
+from cairn_map.evidence.channels import HEIGHT_OFFSET, classes_channel
+from cairn_map.evidence.grid import CellKey, Geometry, centres_of_voxels
 from cairn_map.kernels.morton_kernels import deinterleave
 from cairn_map.wire.change_messages import CellVoxels, RetractChanges
 from cairn_map.wire.messages import Retract
@@ -28,8 +31,11 @@ from cairn_server.store.store import Snapshot
 from cairn_server.store.store_rows import Contribution, MapRow
 from cairn_server.views import map_changes, retract_preview
 
+LEVEL = Geometry(voxel_edge_um=50_000, height_step_um=12_000, depth=3, channels=(HEIGHT_OFFSET,))
+"""A grid whose bins are no whole number of steps of heights."""
+CLASSES = Geometry(voxel_edge_um=50_000, depth=3, channels=(classes_channel(("wall", "table", "chair")),))
 Looks = dict[tuple[float, ...], tuple[int, ...]]
-"""By the centre of a voxel what a view shows of it: probability, temperature (-1: none), colour."""
+"""By the centre of a voxel what a view shows of it: probability, temperature or height (-1: none), colour."""
 
 
 def previewed(live: Live, row: MapRow, *commits: Commit) -> RetractChanges:
@@ -68,6 +74,32 @@ def test_a_preview_names_exactly_what_the_retract_changes(live: Live, epochs: bo
     else:
         row = live.new_map(SMALL)
         commits = [pushed(n, seed) for n, seed in enumerate((0, 1, 3, 6))]
+    changes_are_named(live, row, commits)
+
+
+@pytest.mark.parametrize("grid", ["level", "level with epochs", "classes"])
+def test_a_preview_of_a_level_or_of_classes_names_what_the_page_shows_otherwise(live: Live, grid: str) -> None:
+    geometry, has_epochs = CLASSES if grid == "classes" else LEVEL, grid == "level with epochs"
+    row = live.new_map(geometry, epoch_s=120 if has_epochs else None)
+    layer, commits = MapLayer(geometry=geometry, epoch_s=120), list[Commit]()
+    for n in range(4):
+        if geometry.is_flat:
+            cells = {KEYS[0]: random_evidence(n, geometry, voxels=900, air=3)}
+        else:
+            # What is taken out has votes alone: probabilities stay, and a class may lead by more or less than before.
+            seen = classed_evidence(n, geometry, voxels=300)
+            has_votes = np.isin(np.arange(len(seen)), seen.sampled)
+            cells = {KEYS[0]: replace(seen, counts=0 * seen.counts).where(has_votes) if n % 2 else seen}
+        if has_epochs:
+            commits.append(pushed_in(Epoch(3 * n), n, n, layer=layer, cells=cells))
+        else:
+            commits.append(pushed(n, n, geometry=geometry, cells=cells, sensors=("a", "b", "c")))
+    changes = changes_are_named(live, row, commits)
+    assert changes.otherwise and not changes.warmer and not changes.colder
+
+
+def changes_are_named(live: Live, row: MapRow, commits: list[Commit]) -> RetractChanges:
+    """Push commits and retract two of them; the preview, which named what looked otherwise after it."""
     for commit in commits:
         assert live.push(row, commit).status_code == 201
     live.folded(row)
@@ -81,6 +113,8 @@ def test_a_preview_names_exactly_what_the_retract_changes(live: Live, epochs: bo
     both = {place for place, (now, then) in heat.items() if min(now, then) >= 0}
     assert places(named.gone) == before.keys() - after.keys()
     assert places(named.appeared) == after.keys() - before.keys()
+    if row.geometry.is_flat:
+        both = set()  # heights
     assert places(named.warmer) == {place for place in both if heat[place][1] > heat[place][0]}
     assert places(named.colder) == {place for place in both if heat[place][1] < heat[place][0]}
     differing = {place for place in heat if before[place] != after[place]}
@@ -89,6 +123,7 @@ def test_a_preview_names_exactly_what_the_retract_changes(live: Live, epochs: bo
     assert sum(named.counts.model_dump().values()) == len(differing) + len(before.keys() ^ after.keys()) > 0
     again = previewed(live, row, commits[1])
     assert (again.commits, sum(again.counts.model_dump().values())) == (0, 0), "it is out already"
+    return named
 
 
 def test_previews_are_refused_as_retracts_are(live: Live) -> None:

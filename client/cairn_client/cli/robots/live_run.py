@@ -11,6 +11,7 @@ from cairn_client.cli.range_arguments import integrator_of, returns_line
 from cairn_client.cli.robot_arguments import gate_of, kept_scans_bytes, limits_of, scope_of
 from cairn_client.cli.robots.layer_option import bring_keys, choose_layer
 from cairn_client.cli.robots.replay import default_name, ensure_map
+from cairn_client.folders.state_folder import layer_of
 from cairn_client.live.live_doors import open_door
 from cairn_client.live.live_mapping import LiveMapping
 from cairn_client.live.live_opening import OpenedLive, mapping_for, open_live
@@ -77,7 +78,6 @@ def run_live(args: argparse.Namespace) -> int:
                 stay=args.stay,
                 keep_scans_bytes=kept_bytes,
             )
-            _check_classes(robot, mapping)
         except CairnError as exc:
             if source is not None:
                 source.close()
@@ -99,25 +99,16 @@ def _layer_of(args: argparse.Namespace, mapping: BagMapping) -> MapLayer | None:
     """The map's layer, made if that is asked for; None without a link: the state folder may know it.
 
     Raises:
-        BadInputError: kind `unknown_class`: the labels have names that the layer's classes lack.
+        BadInputError: kind `unknown_class`: the labels have names that the classes of the layer, or of the one that
+            the folder knows, lack.
+        ConflictError: another process has the folder open.
     """
     layer = ensure_map(args, lambda: _channels(mapping))
-    if layer is not None:
-        check_label_names(mapping.label_names, layer.geometry)
+    # Before the robot is opened: closing it again would push what waits, and take it off the map.
+    known = layer_of(args.state) or layer
+    if known is not None:
+        check_label_names(mapping.label_names, known.geometry)
     return layer
-
-
-def _check_classes(robot: Robot, mapping: BagMapping) -> None:
-    """Close a robot whose map, which its folder knew, has other classes than the labels.
-
-    Raises:
-        BadInputError: kind `unknown_class`.
-    """
-    try:
-        check_label_names(mapping.label_names, robot.replica.geometry)
-    except BadInputError:
-        robot.close()
-        raise
 
 
 def _channels(mapping: BagMapping) -> tuple[Channel, ...]:
