@@ -93,6 +93,22 @@ def test_a_page_s_view_has_heights_over_the_nodes_lower_faces(depth: int) -> Non
     assert not len(plain.warm)
 
 
+def test_air_changes_no_surface_in_another_column() -> None:
+    """Bins of 12 mm are no whole number of steps; a view is made with the air of a cell, and without it."""
+    rng = np.random.default_rng(3)
+    places = np.unique(rng.integers(1, 8**LEVEL.depth, 300)).astype(np.uint32)
+    sums = np.stack([np.full(len(places), 3), np.full(len(places), 2)], axis=1)
+    counts = np.tile([2, 0], (len(places), 1))
+    fine = LEVEL.model_copy(update={"height_step_um": 12_000})
+    alone = packed_evidence(places, counts, sums, fine)
+    with_air = packed_evidence(
+        np.insert(places, 0, 0), np.insert(counts, 0, [0, 1], axis=0), np.insert(sums, 0, [0, 0], axis=0), fine
+    )
+    expected, found = shown_surfaces(alone, fine, MODEL), shown_surfaces(with_air, fine, MODEL)
+    np.testing.assert_array_equal(found.voxels, expected.voxels)
+    np.testing.assert_array_equal(found.samples, expected.samples)
+
+
 def test_nothing_is_shown_of_nothing() -> None:
     none = evidence_of([((0, 0, 0), 1, 0, 0)]).where(np.zeros(1, np.bool_))
     assert len(shown_surfaces(none, LEVEL, MODEL)) == 0
