@@ -38,8 +38,8 @@ GENERATIONS = 1 << kernels.GENERATION_BITS
 class _Slots:
     """The slots of this process, which stay where they are until it ends, and the generation of each.
 
-    There is no lock: a finalizer, which gives a slot back, runs wherever Python collects garbage, and so in the middle of
-    `take`, in the thread that would hold the lock. Appending to a deque and popping from it are atomic.
+    There is no lock: a finalizer, which gives a slot back, runs wherever Python collects garbage, so in the middle of
+    `take`, too, in the thread that would hold the lock. Appending to a deque and popping from it are atomic.
     """
 
     def __init__(self) -> None:

@@ -169,6 +169,43 @@ def test_a_ray_passes_the_free_part_of_a_coarse_obstacle_and_ends_in_the_rest() 
     assert layers.cast_rays([0.005, 0.005, 0.005], [1, 0, 0], max_range_m=0.14).hit.tolist() == [False]
 
 
+def nested(*counts: dict[Number, tuple[int, int]]) -> LayeredSnapshot:
+    """Layers of 1, 2 and 4 cm with these hits and misses."""
+    found = {}
+    for edge_um, mine in zip((10_000, 20_000, 40_000), counts, strict=True):
+        whole = HistoryMap(MapLayer(geometry=Geometry(voxel_edge_um=edge_um, depth=3, channels=())))
+        whole.merge(counted(whole.geometry, mine))
+        found[f"at_{edge_um // 10_000}_cm"] = snapshot_of(whole)
+    return LayeredSnapshot(found)
+
+
+def test_a_ray_through_a_free_voxel_ends_at_an_obstacle_of_a_finer_layer_in_it() -> None:
+    layers = nested({(5, 0, 0): (5, 0)}, {(2, 0, 0): (0, 5)}, {(1, 0, 0): (5, 0)})
+    ends = layers.cast_rays([0.005, 0.005, 0.005], [1, 0, 0], max_range_m=1.0)
+    np.testing.assert_allclose(ends.distance_m, [0.045], atol=1e-6)
+    assert ends.names == ["at_1_cm"]
+
+
+def test_rays_end_at_the_first_obstacle_of_layers_nested_in_each_other() -> None:
+    chance = np.random.default_rng(11)
+    for _ in range(10):
+        # Rows of voxels along x: each layer knows half of its own, and has two thirds of these as free.
+        worlds: list[dict[Number, tuple[int, int]]] = [
+            {(x, 0, 0): (0, 5) if chance.random() < 0.67 else (5, 0) for x in range(size) if chance.random() < 0.5}
+            for size in (64, 32, 16)
+        ]
+        layers = nested(*worlds)
+        middles = np.stack([np.arange(64) * 0.01 + 0.005, *np.full((2, 64), 0.005)], axis=1)
+        met, names = layers.state_at(middles) == State.OCCUPIED, layers.names_at(middles)
+        for ways, rows in (([1, 0, 0], range(64)), ([-1, 0, 0], range(63, -1, -1))):
+            ends = layers.cast_rays(middles, ways, max_range_m=1.0)
+            for n in range(64):
+                first = next((row for row in rows if met[row] and (row - n) * ways[0] >= 0), None)
+                expected_m = np.inf if first is None else max(abs(first - n) * 0.01 - 0.005, 0)
+                np.testing.assert_allclose(ends.distance_m[n], expected_m, atol=1e-6)
+                assert ends.names[n] == (None if first is None else names[first])
+
+
 def test_the_nearest_obstacle_is_of_what_no_finer_layer_shows(layers: LayeredSnapshot) -> None:
     points = np.random.default_rng(6).uniform(-1, 1, (50, 3))
     shown = layers.occupied_in()
