@@ -145,7 +145,7 @@ def view_of_reading(row: MapRow, stored: CellRow, evidence: Evidence, depth: int
     style = ViewStyle(depth, is_for_page=True)
     if row.geometry.is_flat:
         evidence = shown_surfaces(evidence, row.geometry, row.sensor_model)
-        style = replace(style, temperature_step_k=HEIGHT_RESOLUTION_M)
+        style = replace(style, scalar_step=HEIGHT_RESOLUTION_M)
     return encode_view(stored.key, evidence, row.geometry, row.sensor_model, style=style)
 
 
