@@ -43,6 +43,7 @@ def clear_met_into(
         b = bricks[m]
         for w in range(8):
             bits = fine.words[b, w, OCCUPIED_BITS]
+            # Most blocks have no occupied voxel.
             if bits == U(0):
                 continue
             for n in range(64):
@@ -53,6 +54,7 @@ def clear_met_into(
                 x = ((2 * x + 1) * fine_edges_um[0]) // (2 * edges_um[0])
                 y = ((2 * y + 1) * fine_edges_um[1]) // (2 * edges_um[1])
                 z = ((2 * z + 1) * fine_edges_um[2]) // (2 * edges_um[2])
+                # It gives way if it is occupied, too; a free one does so only if the finer layer knows all of it.
                 brick = brick_of(grid, x, y, z)
                 if brick != NONE:
                     place = place_of(x, y, z, 7)
@@ -83,10 +85,12 @@ def clear_whole_into(
             known = words[b, w, KNOWN_BITS]
             if known == U(0):
                 continue
+            # Voxel by voxel, those of one block as one word.
             gone = U(0)
             for n in range(64):
                 if (known >> U(n)) & U(1):
                     x, y, z = voxel_at(corners, b, w, n)
+                    # Finer voxels of which the centres lie in this one.
                     first = first_from(x, y, z, edges_um, fine_edges_um)
                     end = first_from(x + 1, y + 1, z + 1, edges_um, fine_edges_um)
                     gone |= U(is_known_whole(fine, first, end)) << U(n)
@@ -98,11 +102,12 @@ def is_known_whole(fine: Grid, first: Number, end: Number) -> bool:
     """True if there are voxels from `first` up to `end`, and all are known."""
     if first[0] >= end[0] or first[1] >= end[1] or first[2] >= end[2]:
         return False
+    # Along x first, which changes the brick every eighth time at most; the first unknown voxel ends it.
     brick = NONE
     for z in range(first[2], end[2]):
         for y in range(first[1], end[1]):
             for x in range(first[0], end[0]):
-                # A brick is looked up once for each of its rows.
+                # A brick is found by its cell's number, which takes longer than all the rest.
                 if x == first[0] or x & 7 == 0:
                     brick = brick_of(fine, x, y, z)
                 if brick == NONE or state_in(fine.words, brick, place_of(x, y, z, 7)) == UNKNOWN:

@@ -170,7 +170,7 @@ class LayeredSnapshot:
         return MapImage(plane_values(x, y, z_m, ask), _origin(x, y), edge_m)
 
     def _points_of(self, what: str) -> Callable[[Floats], npt.NDArray[Any]]:
-        """What `layer_at` asks for each point: a state, a probability, log odds, or the mean of a channel."""
+        """Question that `layer_at` asks of each point: a state, a probability, log odds, or the mean of a channel."""
         match what:
             case "state":
                 return self.state_at
