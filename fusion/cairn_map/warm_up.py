@@ -38,6 +38,7 @@ from cairn_map.evidence.grid import BRICK_DEPTH, CellKey, Geometry, cell_key, le
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.kernels.numba_runtime import report_compiling
 from cairn_map.queries.frozen_map import FreezableMap
+from cairn_map.queries.layers.layered_snapshot import LayeredSnapshot
 from cairn_map.queries.map_snapshot import snapshot_of
 from cairn_map.queries.native.point_handle import PointHandle
 from cairn_map.render.camera_rays import look_at, pinhole
@@ -206,6 +207,7 @@ def _ask(whole: FreezableMap) -> None:
     with suppress(NotFoundError):
         snapshot.grounds()
     snapshot.floor_grid(ground_m=0.0)
+    LayeredSnapshot({"fine": snapshot, "coarse": snapshot}).height_map()
     with PointHandle(snapshot) as handle:
         _ = handle.state_address, handle.states_address
     blend_into(np.zeros((1, 3), np.uint8), np.zeros((1, 4), np.uint8), np.zeros((1, 3), np.uint8))

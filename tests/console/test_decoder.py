@@ -23,8 +23,8 @@ STYLES = (
     ViewStyle(),
     ViewStyle(depth=2),
     ViewStyle(depth=1, extent=Extent.KNOWN),
-    ViewStyle(extent=Extent.KNOWN, chance=Chance.LOG_ODDS, temperature_step_k=0.01),
-    ViewStyle(colours=Colours.RGB_565, temperature_step_k=None),
+    ViewStyle(extent=Extent.KNOWN, chance=Chance.LOG_ODDS, scalar_step=0.01),
+    ViewStyle(colours=Colours.RGB_565, scalar_step=None),
     ViewStyle(colours=Colours.NONE),
 )
 
@@ -56,8 +56,8 @@ def test_the_page_reads_every_view_as_python_does(tmp_path: Path) -> None:
             "chances": digest(view.chances, "<u2"),
             "coloured": digest(view.coloured, "<u4"),
             "rgb": digest(view.rgb, "<i4"),
-            "warm": digest(view.warm, "<u4"),
-            "heats": digest(view.temperatures, "<i4"),
+            "warm": digest(view.scalar_rows, "<u4"),
+            "heats": digest(view.scalar_steps, "<i4"),
         }
         assert {name: said.get(name) for name in arrays} == arrays, (path, said)
         assert (said["cell"], said["depth"], said["cellDepth"]) == ([-3, 0, 7], view.depth, found.cell_depth)

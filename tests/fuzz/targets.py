@@ -113,12 +113,12 @@ def read_view(data: bytes) -> None:
     """A view: its rows name its nodes, and it reads as physical values."""
     view = decode_view(data, nodes_max=1 << 18).view
     assert (np.diff(view.nodes.astype(np.int64)) > 0).all()
-    for rows, values in ((view.coloured, view.rgb), (view.warm, view.temperatures)):
+    for rows, values in ((view.coloured, view.rgb), (view.scalar_rows, view.scalar_steps)):
         assert len(rows) == len(values)
         assert not len(rows) or int(rows[-1]) < len(view)
     assert ((view.probability >= 0) & (view.probability <= 1)).all()
     assert view.colour.shape == view.rgb.shape
-    assert view.temperature_k.shape == view.temperatures.shape
+    assert view.scalars.shape == view.scalar_steps.shape
 
 
 def check_evidence(key: CellKey, evidence: Evidence, geometry: Geometry) -> None:

@@ -9,13 +9,11 @@ Each test is generous by a voxel, so that no rounding leaves a cell out: one mor
 from collections.abc import Callable, Sequence
 
 import numpy as np
-import numpy.typing as npt
 
-from cairn_map.arrays import Floats
+from cairn_map.arrays import Flags, Floats
 from cairn_map.evidence.grid import CellKey, Geometry, cells_of_keys
 
-Bools = npt.NDArray[np.bool_]
-Needs = Callable[[Floats, Floats], Bools]
+Needs = Callable[[Floats, Floats], Flags]
 """Test of cells, (N, 3) lowest and highest corners, metres: (N,) True for those that a question needs."""
 
 
@@ -23,7 +21,7 @@ def near_points(points: Sequence[Sequence[float]], *, radius_m: float = 0.0) -> 
     """Cells within a radius of any of the points, metres, map frame."""
     places = np.asarray(points, np.float64)
 
-    def are_near(low: Floats, high: Floats) -> Bools:
+    def are_near(low: Floats, high: Floats) -> Flags:
         found = np.zeros(len(low), np.bool_)
         for place in places:
             gaps = np.maximum(np.maximum(low - place, place - high), 0.0)
@@ -38,7 +36,7 @@ def along_ray(origin: Sequence[float], direction: Sequence[float], *, range_m: f
     start, way = np.asarray(origin, np.float64), np.asarray(direction, np.float64)
     length = float(np.linalg.norm(way))
 
-    def are_crossed(low: Floats, high: Floats) -> Bools:
+    def are_crossed(low: Floats, high: Floats) -> Flags:
         if not length > 0:
             return np.ones(len(low), np.bool_)
         # Along each axis the ray is between two planes from one distance to another: within a cell where all overlap.

@@ -62,10 +62,10 @@ def encode_view(
     # Values by leaf, and the coders that model them on the leaves' neighbours.
     chances = view.chances[rows]
     coloured = _flags(leaves_of_rows(rows, view.coloured.astype(np.uint32)), N)
-    warm = _flags(leaves_of_rows(rows, view.warm.astype(np.uint32)), N)
+    warm = _flags(leaves_of_rows(rows, view.scalar_rows.astype(np.uint32)), N)
     ground, occupied = ground_of(octree, depth=view.depth), _occupied(chances, view.style)
     colours = _samples_coder(coloured, view.rgb.copy(), occupied, np.zeros(N, np.bool_), ground)
-    temperatures = _samples_coder(warm, view.temperatures.copy(), occupied, coloured, ground)
+    temperatures = _samples_coder(warm, view.scalar_steps.copy(), occupied, coloured, ground)
     # Probabilities come from two small counts, so there are few different ones; ranks, the highest first, are coded.
     palette, ranks = np.unique(-chances, return_inverse=True)
     groups = [
@@ -73,7 +73,7 @@ def encode_view(
         (-palette).astype("<u2").tobytes(),
         _written(_ranks_coder(ranks, ground), N),
         _written(colours, N + view.rgb.size),
-        _written(temperatures, N + view.temperatures.size),
+        _written(temperatures, N + view.scalar_steps.size),
     ]
     head = HEAD.pack(
         MAGIC,
@@ -83,7 +83,7 @@ def encode_view(
         EXTENTS.index(view.style.extent),
         CHANCES.index(view.style.chance),
         COLOURS.index(view.style.colours),
-        view.style.temperature_step_k or 0.0,
+        view.style.scalar_step or 0.0,
         geometry.voxel_edge_um,
         *cell_of_key(key),
         N,
@@ -125,7 +125,7 @@ def decode_view(data: bytes, *, nodes_max: int = NODES_MAX) -> DecodedView:
     # Colours, then temperatures, whose presence is modelled on that of colours.
     occupied, none = _occupied(found, style), np.zeros(N, np.bool_)
     coloured, rgb = _read_samples(colours, occupied, none, ground, columns=len(TOPS[style.colours]))
-    columns = 0 if style.temperature_step_k is None else 1 if depth == head.cell_depth else 2
+    columns = 0 if style.scalar_step is None else 1 if depth == head.cell_depth else 2
     warm, steps = _read_samples(temperatures, occupied, _flags(coloured, N), ground, columns=columns)
     if (rgb > np.array(TOPS[style.colours])).any():
         raise DamagedDataError("bad_view", "a colour is out of range")
@@ -195,7 +195,7 @@ def _as_evidence(view: View) -> Evidence:
     """Evidence whose octree is the view's: nodes collapse where probabilities are equal and no other value is known."""
     # Hits of 1 more than the probability, because a voxel without counts does not exist.
     counts = np.stack([view.chances + 1, np.zeros_like(view.chances)], axis=1).astype(np.int32)
-    sampled = np.union1d(view.coloured, view.warm).astype(np.uint32)
+    sampled = np.union1d(view.coloured, view.scalar_rows).astype(np.uint32)
     return Evidence(view.nodes, counts, sampled, np.zeros((len(sampled), 0), np.int64))
 
 

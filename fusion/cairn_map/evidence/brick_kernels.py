@@ -9,13 +9,12 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_map.arrays import Int32s
+from cairn_map.kernels.integer_kernels import U
 
 Voxels = npt.NDArray[np.uint32]
 BrickNumbers = npt.NDArray[np.int16]
 Pool = npt.NDArray[np.int16] | npt.NDArray[np.int32]
 
-U = np.uint64
-"""Type of the index in hot loops: a signed one is tested for being negative, which takes up to twice the time."""
 RUN = U(32)
 """Voxels without a gap that are added in one vectorised loop; half and twice as many were slower."""
 

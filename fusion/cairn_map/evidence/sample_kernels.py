@@ -10,15 +10,14 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
+from cairn_map.kernels.integer_kernels import U
+
 Voxels = npt.NDArray[np.uint32]
 Rows = npt.NDArray[np.int32]
 Sums = npt.NDArray[np.int64]
 NarrowSums = npt.NDArray[np.int32]
 Planes = npt.NDArray[np.int64]
 Magnitudes = npt.NDArray[np.uint64]
-
-U = np.uint64
-"""Type of the index in hot loops: a signed one is tested for being negative, which takes time."""
 
 
 @nb.njit(cache=True, nogil=True)

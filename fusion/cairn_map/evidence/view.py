@@ -7,7 +7,7 @@ step. At a depth above the voxels, a node has
     colour        the mean of all samples below; without a colour camera that of the class with the most votes below
     temperature   the mean of all samples below, and that of the hottest voxel below
 
-A page gets a level's heights in the place of temperatures.
+A view has one scalar: the temperature, kelvin; for a page that shows a level the height of its surfaces, metres.
 """
 
 from dataclasses import dataclass
@@ -71,19 +71,21 @@ class ViewStyle:
     extent: Extent = Extent.OCCUPIED
     chance: Chance = Chance.BYTE
     colours: Colours = Colours.RGB_888
-    temperature_step_k: float | None = 0.1
-    """Step of temperatures, kelvin; None: no temperatures. Of a level's view for a page: of heights, metres."""
+    scalar_step: float | None = 0.1
+    """Step of the scalar, kelvin; of a level's view for a page metres; None: no scalar."""
     is_for_page: bool = False
     """True if a level has heights in place of temperatures, and classes that lead by less than two votes are paler. It
     is not written: who reads a view knows its map."""
 
     def __post_init__(self) -> None:
-        step = self.temperature_step_k
+        step = self.scalar_step
         if step is not None and not 0.001 <= step <= 1000:
-            raise BadInputError("bad_style", f"temperature_step_k must be 0.001 to 1000 kelvin or None, got {step}")
+            raise BadInputError(
+                "bad_style", f"scalar_step must be 0.001 to 1000 (kelvin or metres) or None, got {step}"
+            )
 
 
-FULL_STYLE = ViewStyle(chance=Chance.LOG_ODDS, temperature_step_k=0.01)
+FULL_STYLE = ViewStyle(chance=Chance.LOG_ODDS, scalar_step=0.01)
 """Style with all fields of the paper at full precision."""
 
 
@@ -101,11 +103,11 @@ class View:
     """(C,) rows of `nodes` that have a colour, rising."""
     rgb: Ints
     """(C, 3) colours, 0 to the largest value of the style; (C, 0) without colours."""
-    warm: Ints
-    """(W,) rows of `nodes` that have a temperature, rising."""
-    temperatures: Ints
-    """(W, 1) means in steps, at the voxels' depth; else (W, 2) means and hottest voxels; (0, 0) without. For a page
-    that shows a level the heights of surfaces over the node's lower face, means and highest, metres."""
+    scalar_rows: Ints
+    """(W,) rows of `nodes` that have a temperature, or a level's surface, rising."""
+    scalar_steps: Ints
+    """(W, 1) means in steps, at the voxels' depth; else (W, 2) means, and the highest of the voxels; (0, 0) without. A
+    level's are heights over the node's lower face."""
 
     def __len__(self) -> int:
         return len(self.nodes)
@@ -128,9 +130,9 @@ class View:
         return _rows_of(nodes, self.nodes)
 
     @property
-    def temperature_k(self) -> Floats:
-        """(W, 1 or 2) mean temperatures, and of inner nodes the hottest voxels'; kelvin."""
-        return self.temperatures.astype(np.float64) * (self.style.temperature_step_k or np.nan)
+    def scalars(self) -> Floats:
+        """(W, 1 or 2) means, and of inner nodes the highest of the voxels; kelvin, or a level's heights, metres."""
+        return self.scalar_steps.astype(np.float64) * (self.style.scalar_step or np.nan)
 
 
 def view_of(evidence: Evidence, geometry: Geometry, model: SensorModel, style: ViewStyle) -> View:
@@ -158,13 +160,13 @@ def view_of(evidence: Evidence, geometry: Geometry, model: SensorModel, style: V
         coloured, rgb = _colours(evidence.samples[:, geometry.planes_of(colour.name)], colour, rows, style)
     elif named is not None and style.colours is not Colours.NONE:
         coloured, rgb = _class_colours(evidence.samples[:, geometry.planes_of(named.name)], named, rows, style)
-    columns = 0 if style.temperature_step_k is None else 1 if depth == geometry.depth else 2
-    warm, temperatures = np.empty(0, np.int64), np.empty((0, columns), np.int64)
-    if style.temperature_step_k is not None:
+    columns = 0 if style.scalar_step is None else 1 if depth == geometry.depth else 2
+    scalar_rows, steps = np.empty(0, np.int64), np.empty((0, columns), np.int64)
+    if style.scalar_step is not None:
         has_heights = geometry.is_flat and style.is_for_page
-        warm, values = (_heights if has_heights else _kelvins)(evidence, geometry, rows, up)
-        temperatures = np.rint(np.maximum(values[:, :columns], 0) / style.temperature_step_k).astype(np.int64)
-    return View(depth, style, nodes, chances.astype(np.int64), coloured, rgb, warm, temperatures)
+        scalar_rows, values = (_heights if has_heights else _kelvins)(evidence, geometry, rows, up)
+        steps = np.rint(np.maximum(values[:, :columns], 0) / style.scalar_step).astype(np.int64)
+    return View(depth, style, nodes, chances.astype(np.int64), coloured, rgb, scalar_rows, steps)
 
 
 def _nodes(evidence: Evidence, model: SensorModel, extent: Extent, *, up: int) -> tuple[npt.NDArray[np.uint32], Floats]:
@@ -267,7 +269,7 @@ def evidence_of_view(view: View, geometry: Geometry, model: SensorModel) -> Evid
     is_occupied = odds > log_odds(model.p_occupied)
     samples = np.zeros((len(view), geometry.plane_count), np.int64)
     _put_samples(samples, view.coloured, view.colour.astype(np.float64), geometry, ChannelKind.COLOUR)
-    _put_samples(samples, view.warm, view.temperature_k[:, :1], geometry, ChannelKind.TEMPERATURE)
+    _put_samples(samples, view.scalar_rows, view.scalars[:, :1], geometry, ChannelKind.TEMPERATURE)
     sampled = np.nonzero(samples.any(axis=1))[0]
     return Evidence(
         voxels=view.nodes,

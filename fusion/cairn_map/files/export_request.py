@@ -202,7 +202,7 @@ def _chosen(
     colours: Colours,
     step_k: float | None,
 ) -> Chosen:
-    style = ViewStyle(asked.depth_in(geometry), chance=Chance.LOG_ODDS, colours=colours, temperature_step_k=step_k)
+    style = ViewStyle(asked.depth_in(geometry), chance=Chance.LOG_ODDS, colours=colours, scalar_step=step_k)
     view = view_of(evidence, geometry, model, style)
     centres_m = _centres(view.nodes, key, geometry, asked)
     rows = _within_bounds(centres_m, asked)
@@ -233,7 +233,7 @@ def _within_band(view: View, asked: ExportRequest) -> npt.NDArray[np.bool_]:
     """(N,) True where the hottest voxel is hot enough and the mean is cold enough, as on the console."""
     least, most = asked.band_k()
     rows = np.zeros(len(view), np.bool_)
-    kelvin = view.temperature_k
+    kelvin = view.scalars
     slack = TEMPERATURE_STEP_K / 100
-    rows[view.warm] = (kelvin[:, -1] >= least - slack) & (kelvin[:, 0] <= most + slack)
+    rows[view.scalar_rows] = (kelvin[:, -1] >= least - slack) & (kelvin[:, 0] <= most + slack)
     return rows

@@ -135,8 +135,8 @@ def points_of_cell(
         table[name][view.coloured] = view.colour[:, c]
     table["probability"] = view.probability
     table["temperature"] = table["hottest"] = np.nan
-    table["temperature"][view.warm] = view.temperature_k[:, 0]
-    table["hottest"][view.warm] = view.temperature_k[:, -1]
+    table["temperature"][view.scalar_rows] = view.scalars[:, 0]
+    table["hottest"][view.scalar_rows] = view.scalars[:, -1]
     if measured_s is None and named is None:
         return table[chosen.rows]
     rows = view.rows_of(evidence.voxels[evidence.sampled] >> np.uint32(3 * (geometry.depth - view.depth)))

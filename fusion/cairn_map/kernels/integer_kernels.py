@@ -3,6 +3,9 @@
 import numba as nb
 import numpy as np
 
+U = np.uint64
+"""Type of the index in hot loops: a signed one is tested for being negative, which takes up to twice the time."""
+
 
 @nb.njit(nogil=True, forceinline=True)
 def signed(number: np.integer) -> int:

@@ -10,7 +10,7 @@ import numba as nb
 import numpy as np
 
 from cairn_map.arrays import Bytes, Floats, Ints
-from cairn_map.kernels.integer_kernels import signed
+from cairn_map.kernels.integer_kernels import U, signed
 from cairn_map.queries.occupancy_kernels import (
     FREE,
     KNOWN_BITS,
@@ -18,7 +18,6 @@ from cairn_map.queries.occupancy_kernels import (
     OCCUPIED_BITS,
     UNKNOWN,
     Grid,
-    U,
     place_of,
     slot_of,
     x_in_block,

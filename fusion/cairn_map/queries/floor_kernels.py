@@ -9,7 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_map.arrays import Ints
-from cairn_map.queries.occupancy_kernels import KNOWN_BITS, OCCUPIED_BITS, Grid, U, brick_of, x_in_block
+from cairn_map.kernels.integer_kernels import U
+from cairn_map.queries.occupancy_kernels import KNOWN_BITS, OCCUPIED_BITS, Grid, brick_of, x_in_block
 
 LAYER = U(0x0F0F0F0F)
 """Bits of a block's lowest layer; those of the second are higher by 4, of the third by 32, of the fourth by 36."""

@@ -7,7 +7,8 @@ import numba as nb
 import numpy as np
 
 from cairn_map.arrays import Ints, Words
-from cairn_map.queries.occupancy_kernels import KNOWN_BITS, OCCUPIED_BITS, Grid, U, brick_of, place_of, x_in_block
+from cairn_map.kernels.integer_kernels import U
+from cairn_map.queries.occupancy_kernels import KNOWN_BITS, OCCUPIED_BITS, Grid, brick_of, place_of, x_in_block
 
 ALL = ~U(0)
 """The word of a block whose voxels are all in the set."""

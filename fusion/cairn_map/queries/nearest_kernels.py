@@ -11,9 +11,9 @@ import numpy as np
 
 from cairn_map.arrays import Floats, Ints
 from cairn_map.evidence.grid import NANOMETRES
-from cairn_map.kernels.integer_kernels import signed
+from cairn_map.kernels.integer_kernels import U, signed
 from cairn_map.kernels.morton_kernels import squeeze
-from cairn_map.queries.occupancy_kernels import KNOWN_BITS, OCCUPIED_BITS, Grid, U, brick_of, voxel_of, x_in_block
+from cairn_map.queries.occupancy_kernels import KNOWN_BITS, OCCUPIED_BITS, Grid, brick_of, voxel_of, x_in_block
 from cairn_map.queries.point_kernels import is_within
 
 

@@ -14,13 +14,11 @@ import numpy.typing as npt
 
 from cairn_map.arrays import Floats, Int32s, Ints, Words
 from cairn_map.evidence.grid import CELL_LIMIT, NANOMETRES
-from cairn_map.kernels.integer_kernels import signed
+from cairn_map.kernels.integer_kernels import U, signed
 from cairn_map.kernels.morton_kernels import squeeze
 
 Pool = npt.NDArray[np.int16] | npt.NDArray[np.int32]
 
-U = np.uint64
-"""Type of the index in hot loops: a signed one is tested for being negative, which takes time."""
 UNKNOWN, FREE, OCCUPIED = np.uint8(0), np.uint8(1), np.uint8(2)
 OCCUPIED_BITS, KNOWN_BITS = U(0), U(1)
 NONE = -1

@@ -10,7 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_map.arrays import Bytes, Floats, Int32s, Ints
-from cairn_map.queries.occupancy_kernels import NONE, UNKNOWN, Grid, Pool, U, place_of, slot_of, state_in, voxel_of
+from cairn_map.kernels.integer_kernels import U
+from cairn_map.queries.occupancy_kernels import NONE, UNKNOWN, Grid, Pool, place_of, slot_of, state_in, voxel_of
 
 Places = npt.NDArray[np.uint32]
 BLOCK = 256

@@ -14,7 +14,7 @@ import numpy as np
 
 from cairn_map.arrays import Bytes, Floats, Ints
 from cairn_map.evidence.grid import NANOMETRES
-from cairn_map.kernels.integer_kernels import signed
+from cairn_map.kernels.integer_kernels import U, signed
 from cairn_map.queries.occupancy_kernels import (
     FREE,
     KNOWN_BITS,
@@ -23,7 +23,6 @@ from cairn_map.queries.occupancy_kernels import (
     OCCUPIED_BITS,
     UNKNOWN,
     Grid,
-    U,
     place_of,
     slot_of,
     voxel_of,

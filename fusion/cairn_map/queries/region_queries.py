@@ -54,16 +54,19 @@ def layer(frozen: FrozenMap, z_m: float, what: str, box_m: Box | None) -> MapIma
     ask = _question(frozen, what)
     low, high = frozen.voxels_of_box(box_m)
     check_pixels(low, high)
-    W, H = high[0] - low[0], high[1] - low[1]
-    centres_x, centres_y = (_centres(frozen, low[axis], high[axis]) for axis in (0, 1))
-    rows_at_once = max(1, point_queries.CHUNK // max(W, 1))
+    x, y = (pixel_centres(low[axis], high[axis], frozen.geometry.voxel_edge_um) for axis in (0, 1))
+    return _image(frozen, plane_values(x, y, z_m, ask), low)
+
+
+def plane_values(x: Floats, y: Floats, z_m: float, ask: Callable[[Floats], Values]) -> Values:
+    """(H, W) answers, or (H, W, 3), at a height over W places along x and H along y, some rows of them at a time."""
+    rows_at_once = max(1, point_queries.CHUNK // max(len(x), 1))
     parts: list[Values] = []
-    for start in range(0, max(H, 1), rows_at_once):
-        y, x = np.meshgrid(centres_y[start : start + rows_at_once], centres_x, indexing="ij")
-        points = np.stack([x.ravel(), y.ravel(), np.full(x.size, z_m)], axis=1)
-        values = ask(points)
-        parts.append(values.reshape(*x.shape, *values.shape[1:]))
-    return _image(frozen, np.concatenate(parts), low)
+    for start in range(0, max(len(y), 1), rows_at_once):
+        at_y, at_x = np.meshgrid(y[start : start + rows_at_once], x, indexing="ij")
+        values = ask(np.stack([at_x.ravel(), at_y.ravel(), np.full(at_x.size, z_m)], axis=1))
+        parts.append(values.reshape(*at_x.shape, *values.shape[1:]))
+    return np.concatenate(parts)
 
 
 def height_map(frozen: FrozenMap, box_m: Box | None) -> MapImage:
@@ -112,10 +115,9 @@ def check_pixels(low: Ints, high: Ints, *, most: int = PIXELS_MAX) -> None:
         raise BadInputError("too_large", f"an image has at most {most} pixels, not {pixels}; give a smaller box")
 
 
-def _centres(frozen: FrozenMap, low: int, high: int) -> Floats:
-    voxels = np.zeros((high - low, 3), np.int64)
-    voxels[:, 0] = np.arange(low, high)
-    return centres_of_voxels(voxels, frozen.geometry)[:, 0]
+def pixel_centres(first: int, end: int, edge_um: int) -> Floats:
+    """Centres along one axis of the pixels from `first` up to `end`, metres."""
+    return np.asarray((2 * np.arange(first, end) + 1) * (edge_um / 2e6), dtype=np.float64)
 
 
 def _image(frozen: FrozenMap, values: Values, low: npt.NDArray[np.int64]) -> MapImage:

@@ -13,8 +13,8 @@ import numpy.typing as npt
 
 from cairn_map.arrays import Bytes, Floats, Int32s, Ints, Rgb
 from cairn_map.evidence.grid import NANOMETRES
-from cairn_map.kernels.integer_kernels import signed
-from cairn_map.queries.occupancy_kernels import KNOWN_BITS, NONE, OCCUPIED_BITS, Grid, U, place_of, slot_of
+from cairn_map.kernels.integer_kernels import U, signed
+from cairn_map.queries.occupancy_kernels import KNOWN_BITS, NONE, OCCUPIED_BITS, Grid, place_of, slot_of
 from cairn_map.queries.ray_kernels import NOWHERE, enter_box_into, is_in_box, leave_block, ray_through, walk_block
 
 Table = npt.NDArray[np.float32]

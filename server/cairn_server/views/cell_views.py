@@ -152,7 +152,7 @@ def page_reading(row: MapRow, evidence: Evidence, depth: int) -> tuple[Evidence,
     if not row.geometry.is_flat:
         return evidence, style
     shown = shown_surfaces(evidence, row.geometry, row.sensor_model)
-    return shown, replace(style, temperature_step_k=HEIGHT_RESOLUTION_M)
+    return shown, replace(style, scalar_step=HEIGHT_RESOLUTION_M)
 
 
 class ViewCache:

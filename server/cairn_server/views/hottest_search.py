@@ -13,9 +13,8 @@ from dataclasses import dataclass, field, replace
 from itertools import product
 
 import numpy as np
-import numpy.typing as npt
 
-from cairn_map.arrays import Floats, Words32
+from cairn_map.arrays import Flags, Floats, Words32
 from cairn_map.evidence.brick_cell import BrickCell, brick_cell, reading_cell
 from cairn_map.evidence.channels import Channel, ChannelKind
 from cairn_map.evidence.grid import CELL_LIMIT, CellKey, Geometry, cell_key, cell_of_key, split_voxels, voxels_in_cell
@@ -40,7 +39,6 @@ CELLS_BYTES = 1 << 27
 OCCUPIED_FROM = 0.5
 """Least probability of a voxel that counts."""
 ZERO_CELSIUS_K = 273.15
-Bools = npt.NDArray[np.bool_]
 
 
 class HottestSearch:
@@ -155,7 +153,7 @@ class _Search:
         self.sure, self.doubtful = self._with(key, self._ranked(key, cells)) if wanted else alone
         return True
 
-    def _ranked(self, key: CellKey, cells: Mapping[CellKey, _HotCell]) -> tuple[Voxels, Bools]:
+    def _ranked(self, key: CellKey, cells: Mapping[CellKey, _HotCell]) -> tuple[Voxels, Flags]:
         """Hottest voxels of a cell, and which of them are confirmed by what these cells hold."""
         part = _Part(self.row.geometry, {each: cell.bricks for each, cell in cells.items()})
         frozen, box_m = freeze(part, self.row.sensor_model), np.stack(self.asked.bounds_m())
@@ -171,7 +169,7 @@ class _Search:
         name = self.channel.name
         return replace(voxels, readings={name: replace(voxels.readings[name], measured_s=measured_s)})
 
-    def _with(self, key: CellKey, ranked: tuple[Voxels, Bools]) -> tuple[list[HotVoxel], list[HotVoxel]]:
+    def _with(self, key: CellKey, ranked: tuple[Voxels, Flags]) -> tuple[list[HotVoxel], list[HotVoxel]]:
         """The hottest confirmed voxels, and the others, of all cells so far and this one."""
         voxels, are_sure = ranked
         rows = np.nonzero(are_sure)[0], np.nonzero(~are_sure)[0]

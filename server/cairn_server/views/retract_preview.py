@@ -191,8 +191,8 @@ def _differences(now: View, then: View, *, has_heights: bool) -> dict[str, Ints]
 def _heats(view: View) -> Ints:
     """(V,) mean temperatures, or heights of a level, of a view's nodes, in its steps; `NO_HEAT`: none."""
     heats = np.full(len(view), NO_HEAT, np.int64)
-    if len(view.warm):
-        heats[view.warm] = view.temperatures.reshape(len(view.warm), -1)[:, 0]
+    if len(view.scalar_rows):
+        heats[view.scalar_rows] = view.scalar_steps.reshape(len(view.scalar_rows), -1)[:, 0]
     return heats
 
 

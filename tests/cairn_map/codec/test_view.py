@@ -17,14 +17,14 @@ from cairn_map.evidence.inverse_sensor_model import SensorModel, log_odds
 from cairn_map.evidence.view import FULL_STYLE, LOG_ODDS_ZERO, TOPS, Chance, Colours, Extent, View, ViewStyle, view_of
 
 MODEL = SensorModel()
-COLUMNS = ("nodes", "chances", "coloured", "rgb", "warm", "temperatures")
+COLUMNS = ("nodes", "chances", "coloured", "rgb", "scalar_rows", "scalar_steps")
 STYLES = st.builds(
     ViewStyle,
     depth=st.one_of(st.none(), st.integers(1, 3)),
     extent=st.sampled_from(Extent),
     chance=st.sampled_from(Chance),
     colours=st.sampled_from(Colours),
-    temperature_step_k=st.sampled_from([None, 0.01, 0.1, 5.0]),
+    scalar_step=st.sampled_from([None, 0.01, 0.1, 5.0]),
 )
 
 
@@ -92,9 +92,9 @@ def check_colours(view: View, nodes: dict[int, list[tuple[float, tuple[int, ...]
 
 def check_temperatures(view: View, nodes: dict[int, list[tuple[float, tuple[int, ...]]]], geometry: Geometry) -> None:
     channel = next((c for c in geometry.channels if c.kind is ChannelKind.TEMPERATURE), None)
-    step = view.style.temperature_step_k
+    step = view.style.scalar_step
     if channel is None or step is None:
-        assert not len(view.warm)
+        assert not len(view.scalar_rows)
         return
     planes = geometry.planes_of(channel.name)
     expected = {}
@@ -103,8 +103,8 @@ def check_temperatures(view: View, nodes: dict[int, list[tuple[float, tuple[int,
         if rows:
             mean = sum(r[0] for r in rows) / sum(r[-1] for r in rows)
             expected[node] = [mean * channel.step, max(r[0] / r[-1] for r in rows) * channel.step]
-    assert view.nodes[view.warm].tolist() == sorted(expected)
-    for node, kelvin in zip(view.nodes[view.warm].tolist(), view.temperature_k, strict=True):
+    assert view.nodes[view.scalar_rows].tolist() == sorted(expected)
+    for node, kelvin in zip(view.nodes[view.scalar_rows].tolist(), view.scalars, strict=True):
         assert np.abs(kelvin - expected[node][: len(kelvin)]).max() <= step / 2 + 1e-9
 
 
@@ -123,7 +123,7 @@ def test_a_style_that_no_cell_has_is_refused() -> None:
             encode_view(KEY, evidence, SMALL, MODEL, style=ViewStyle(depth=depth))
     for step in (0.0, -1.0, float("nan"), 1e9):
         with pytest.raises(BadInputError, match="kelvin"):
-            ViewStyle(temperature_step_k=step)
+            ViewStyle(scalar_step=step)
 
 
 SOUND = encode_view(KEY, random_evidence(3, MIDDLE, voxels=60), MIDDLE, MODEL, style=ViewStyle(extent=Extent.KNOWN))
@@ -137,7 +137,7 @@ def survives(data: bytes) -> None:
     assert (np.diff(view.nodes.astype(np.int64)) > 0).all()
     assert view.probability.shape == (len(view),)
     assert (view.coloured < len(view)).all()
-    assert (view.warm < len(view)).all()
+    assert (view.scalar_rows < len(view)).all()
 
 
 def test_cut_views_are_refused() -> None:

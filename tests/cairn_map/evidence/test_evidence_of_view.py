@@ -15,7 +15,7 @@ from cairn_map.evidence.view import Chance, Extent, ViewStyle, evidence_of_view
 from cairn_map.evidence.voxels import voxels_of_evidence
 
 MODEL = SensorModel()
-STYLE = ViewStyle(extent=Extent.KNOWN, chance=Chance.LOG_ODDS, temperature_step_k=0.01)
+STYLE = ViewStyle(extent=Extent.KNOWN, chance=Chance.LOG_ODDS, scalar_step=0.01)
 
 
 def test_a_view_shows_the_states_and_temperatures_of_the_reading_that_it_was_made_of() -> None:

@@ -1,6 +1,7 @@
 """Handles on a snapshot for compiled code: they answer as the snapshot does, and refuse once they are closed."""
 
 import ctypes
+import gc
 import math
 import re
 import runpy
@@ -10,6 +11,7 @@ import sys
 import threading
 import weakref
 from pathlib import Path
+from typing import Any
 
 import numba as nb
 import numpy as np
@@ -150,6 +152,35 @@ def test_a_slot_is_left_after_its_last_generation(monkeypatch: pytest.MonkeyPatc
     assert numbers[2] >> kernels.GENERATION_BITS != numbers[0] >> kernels.GENERATION_BITS
 
 
+@pytest.mark.usefixtures("fresh_slots")
+def test_garbage_may_be_collected_while_a_handle_is_opened(
+    monkeypatch: pytest.MonkeyPatch, snapshot: MapSnapshot
+) -> None:
+    zeros = np.zeros
+
+    def collecting(*shape: Any) -> Any:
+        if shape[0] == 2 * point_handle.SLOT_WORDS:
+            gc.collect()
+        return zeros(*shape)
+
+    opened: list[int] = []
+
+    def open_many() -> None:
+        for _ in range(4):
+            # A holder that refers to itself, so that only a collection finds it: one that begins as slots are made.
+            holder: list[Any] = [PointHandle(snapshot)]
+            holder.append(holder)
+            opened.append(holder[0].map)
+            del holder
+
+    monkeypatch.setattr(np, "zeros", collecting)
+    # A daemon: a thread that waits for itself never ends.
+    opening = threading.Thread(target=open_many, daemon=True)
+    opening.start()
+    opening.join(30)
+    assert len({*opened}) == 4
+
+
 def test_a_handle_keeps_the_states_of_its_snapshot_until_it_is_closed_or_gone() -> None:
     whole = random_map(1, PLAIN)
     points = random_points(3, whole, 200)
@@ -193,15 +224,21 @@ def test_closing_waits_for_calls_in_progress() -> None:
     assert words() is None
 
 
+@pytest.mark.usefixtures("fresh_slots")
 def test_a_forked_process_does_not_wait_for_calls_that_are_not_its_own(
     snapshot: MapSnapshot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     handle = PointHandle(snapshot)
     calls = calls_of(handle)
     calls.value = 1
+    slot = handle.map >> kernels.GENERATION_BITS
     monkeypatch.setattr(point_handle.os, "getpid", lambda: -1)
     handle.close()
+    # Handles of the forked process never take the slot, whose calls stay counted: they would not close.
+    later = PointHandle(snapshot)
     calls.value = 0
+    assert later.map >> kernels.GENERATION_BITS != slot
+    later.close()
 
 
 def test_calls_of_many_threads_are_answered_or_refused_while_handles_come_and_go() -> None:

@@ -80,17 +80,33 @@ def test_the_lowest_surfaces_are_those_of_the_elevation() -> None:
 def test_a_page_s_view_has_heights_over_the_nodes_lower_faces(depth: int) -> None:
     rows: list[Row] = [((1, 2, 5), 4, 4, 20), ((2, 2, 6), 4, 4, 0)]
     evidence = shown_surfaces(evidence_of(rows), LEVEL, MODEL)
-    style = ViewStyle(depth, is_for_page=True, temperature_step_k=HEIGHT_RESOLUTION_M)
+    style = ViewStyle(depth, is_for_page=True, scalar_step=HEIGHT_RESOLUTION_M)
     view = decode_view(encode_view(KEY, evidence, LEVEL, MODEL, style=style)).view
     found = {
         deinterleave(int(view.nodes[row])): steps
-        for row, steps in zip(view.warm, view.temperatures.tolist(), strict=True)
+        for row, steps in zip(view.scalar_rows, view.scalar_steps.tolist(), strict=True)
     }
     bins = {4: {(1, 2, 5): [25], (2, 2, 6): [0]}, 2: {(0, 0, 1): [(75 + 100) / 2, 100]}}
     assert {node: pytest.approx(steps, abs=1) for node, steps in bins[depth].items()} == found
     # Exports and robots get views without them.
     plain = decode_view(encode_view(KEY, evidence, LEVEL, MODEL, style=ViewStyle(depth))).view
-    assert not len(plain.warm)
+    assert not len(plain.scalar_rows)
+
+
+def test_air_changes_no_surface_in_another_column() -> None:
+    """Bins of 12 mm are no whole number of steps; a view is made with the air of a cell, and without it."""
+    rng = np.random.default_rng(3)
+    places = np.unique(rng.integers(1, 8**LEVEL.depth, 300)).astype(np.uint32)
+    sums = np.stack([np.full(len(places), 3), np.full(len(places), 2)], axis=1)
+    counts = np.tile([2, 0], (len(places), 1))
+    fine = LEVEL.model_copy(update={"height_step_um": 12_000})
+    alone = packed_evidence(places, counts, sums, fine)
+    with_air = packed_evidence(
+        np.insert(places, 0, 0), np.insert(counts, 0, [0, 1], axis=0), np.insert(sums, 0, [0, 0], axis=0), fine
+    )
+    expected, found = shown_surfaces(alone, fine, MODEL), shown_surfaces(with_air, fine, MODEL)
+    np.testing.assert_array_equal(found.voxels, expected.voxels)
+    np.testing.assert_array_equal(found.samples, expected.samples)
 
 
 def test_nothing_is_shown_of_nothing() -> None:

@@ -54,7 +54,7 @@ def looks(live: Live, row: MapRow) -> Looks:
         voxels = deinterleave(view.nodes.astype(np.uint64)) + np.array(entry["cell"]) * row.geometry.side
         values = np.full((len(view.nodes), 5), -1)
         values[:, 0] = view.chances
-        values[view.warm, 1] = view.temperatures[:, 0]
+        values[view.scalar_rows, 1] = view.scalar_steps[:, 0]
         values[view.coloured, 2:] = view.rgb
         places = np.round(centres_of_voxels(voxels, row.geometry), 6).tolist()
         found |= {tuple(place): tuple(each) for place, each in zip(places, values.tolist(), strict=True)}

@@ -12,9 +12,9 @@ import numpy.typing as npt
 
 from cairn_map.arrays import Int32s, Ints, Words32
 from cairn_map.codec.entropy.arithmetic_kernels import EVEN, Coder, Data, Live, resumed, suspend_into
-from cairn_map.codec.entropy.mixing_kernels import SLOTS, TAILS, Opinions, U, code_mixed, code_number, start_weights
+from cairn_map.codec.entropy.mixing_kernels import SLOTS, TAILS, Opinions, code_mixed, code_number, start_weights
 from cairn_map.codec.entropy.neighbour_kernels import NONE, leaf_at, lower_places, upper_places
-from cairn_map.kernels.integer_kernels import signed
+from cairn_map.kernels.integer_kernels import U, signed
 
 COUNT_MAX = (1 << 31) - 1
 Leaves = tuple[int, int, int, int, int, int, int]

@@ -13,9 +13,9 @@ import numpy as np
 
 from cairn_map.arrays import Bytes
 from cairn_map.codec.entropy.arithmetic_kernels import EVEN, Coder, Data, resumed, suspend_into
-from cairn_map.codec.entropy.mixing_kernels import Opinions, U, code_mixed, start_weights
+from cairn_map.codec.entropy.mixing_kernels import Opinions, code_mixed, start_weights
 from cairn_map.codec.entropy.neighbour_kernels import NONE, lower_places, upper_places
-from cairn_map.kernels.integer_kernels import signed
+from cairn_map.kernels.integer_kernels import U, signed
 
 ABSENT, INNER, LEAF, SIBLING = 0, 1, 2, 3
 """States; SIBLING: an upper neighbour inside the same parent, which is unknown yet."""

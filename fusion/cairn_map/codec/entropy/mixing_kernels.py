@@ -15,10 +15,8 @@ import numpy.typing as npt
 
 from cairn_map.arrays import Ints
 from cairn_map.codec.entropy.arithmetic_kernels import Data, Live, Odds, code_bit, learnt, split
-from cairn_map.kernels.integer_kernels import signed
+from cairn_map.kernels.integer_kernels import U, signed
 
-U = np.uint64
-"""Type of the index in hot loops: a signed one is tested for being negative, which takes time."""
 KNOTS = np.array(
     [
         *(1, 2, 3, 6, 10, 16, 27, 45, 73, 120, 194, 310, 488, 747, 1101, 1546, 2047),

@@ -8,7 +8,7 @@ import numba as nb
 import numpy as np
 
 from cairn_map.arrays import Int32s, Ints, Words32
-from cairn_map.kernels.integer_kernels import signed
+from cairn_map.kernels.integer_kernels import U, signed
 
 AXIS = 0x09249249
 """Every third bit of a place: x; shifted by 1 y, by 2 z."""
@@ -23,8 +23,6 @@ STEPS = np.array(
     np.int64,
 )
 """Steps to neighbours that may come before: faces, lower edges, mixed edges, the corner."""
-U = np.uint64
-"""Type of the index in hot loops: a signed one is tested for being negative, which takes time."""
 
 
 @nb.njit(cache=True, nogil=True)

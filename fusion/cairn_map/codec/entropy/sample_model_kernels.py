@@ -13,7 +13,7 @@ from cairn_map.codec.entropy.arithmetic_kernels import EVEN, Coder, Data, code_b
 from cairn_map.codec.entropy.mixing_kernels import SLOTS, TAILS, code_number, start_weights
 from cairn_map.codec.entropy.neighbour_kernels import NONE, leaf_at, lower_places
 from cairn_map.codec.octree.sum_kernels import square_guess
-from cairn_map.kernels.integer_kernels import signed
+from cairn_map.kernels.integer_kernels import U, signed
 
 NEARNESS = np.array([4, 4, 4, 2, 2, 2, 2, 2, 2, 2, 2, 2, 1], np.int64)
 """Weight of a neighbour in a guess, by `neighbour_kernels.STEPS`: faces, edges, the corner."""
@@ -24,9 +24,8 @@ WEIGHT_MAX = 1 << 16
 """Exclusive bound of weights that take part in guesses, for the same reason."""
 RANK_MAX = (1 << 16) - 1
 """Largest rank in a view's palette."""
-U = np.uint64
-"""Type of the index in hot loops: a signed one is tested for being negative, which takes time."""
 SHIFTS = [max(x.bit_length() - 2, 0) for x in range(512)]
+"""Bits by which a small number is shifted so that its highest two are left."""
 HALF_LOGS = np.array([2 * shift + (x >> shift) for x, shift in enumerate(SHIFTS)], np.int8)
 """Buckets of small numbers, by `half_log`."""
 TABLE = 2048
@@ -238,7 +237,7 @@ def code_ranks(coder: Coder, data: Data, ranks: Ints, near: Int32s) -> bool:
             (TABLE + faces) * SLOTS,
             (2 * TABLE + firsts * 14 + count) * SLOTS,
         )
-        ranks[s], live = code_number(live, data, odds, contexts, loud, 0, tails, 0, ranks[s])  # pyright: ignore[reportArgumentType]
+        ranks[s], live = code_number(live, data, odds, contexts, loud, 0, tails, 0, signed(ranks[s]))
         if ranks[s] < 0 or ranks[s] > RANK_MAX:
             return False
     suspend_into(coder, live)

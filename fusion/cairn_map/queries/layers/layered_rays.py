@@ -81,9 +81,11 @@ def cast_layers(
         answering, states = _answers(frozen, inside, which)
         is_end = states == State.OCCUPIED
         ends_m[rows[is_end]], of_layer[rows[is_end]] = found_m[is_end], answering[is_end]
-        # Free there: on to where the ray leaves the finer voxel.
-        rows, found_m = rows[~is_end], found_m[~is_end]
-        at_m[rows] = found_m + 2 * step_m + _way_out_m(frozen, answering[~is_end], inside[~is_end], units[rows])
+        # Free there: on to where the ray leaves that voxel, or before to an occupied one of a layer finer still, in it.
+        rows, found_m, answering = rows[~is_end], found_m[~is_end], answering[~is_end]
+        out_m = found_m + 2 * step_m + _way_out_m(frozen, answering, inside[~is_end], units[rows])
+        is_finer = np.arange(len(frozen))[:, None] < answering
+        at_m[rows] = np.minimum(out_m, np.where(is_finer, next_m[:, rows], np.inf).min(axis=0))
         rows = rows[at_m[rows] <= max_range_m]
     points = origins + units * np.where(np.isfinite(ends_m), ends_m, np.nan)[:, None]
     return LayeredEnds(ends_m, points, of_layer, names)

@@ -21,22 +21,22 @@ import numpy.typing as npt
 
 from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError, NotFoundError
-from cairn_map.evidence.channels import Channel, ChannelKind
+from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.grid import check_cubes
 from cairn_map.evidence.voxels import Reading, Voxels
-from cairn_map.queries import point_queries, region_queries
+from cairn_map.queries import region_queries
 from cairn_map.queries.frozen_map import Box, FrozenMap, as_points
-from cairn_map.queries.layers.finest_voxels import centres, finest_states, voxels_by_layer
+from cairn_map.queries.layers.finest_voxels import are_alike, finest_states, voxels_by_layer
 from cairn_map.queries.layers.layered_rays import LayeredEnds, cast_layers, nearest_of_layers
 from cairn_map.queries.map_snapshot import MapSnapshot
 from cairn_map.queries.occupancy_states import State
-from cairn_map.queries.region_queries import MapImage, check_pixels
+from cairn_map.queries.region_queries import MapImage, check_pixels, pixel_centres, plane_values
 
 
 class LayeredSnapshot:
     """Snapshots of a map's layers; arrays in, arrays out, as `MapSnapshot`."""
 
-    __slots__ = ("_finest", "_layers")
+    __slots__ = ("_finest", "_finest_cubes", "_layers")
 
     def __init__(self, layers: Mapping[str, MapSnapshot]) -> None:
         """Take the layers by name, at least one.
@@ -49,6 +49,7 @@ class LayeredSnapshot:
         finest_first = sorted(layers, key=lambda name: (layers[name].geometry.voxel_edge_um, name))
         self._layers = {name: layers[name] for name in finest_first}
         self._finest: dict[str, FrozenMap] | None = None
+        self._finest_cubes: dict[str, FrozenMap] | None = None
 
     def __repr__(self) -> str:
         edges = ", ".join(f"{name} {layer.geometry.voxel_edge_m:g} m" for name, layer in self._layers.items())
@@ -102,7 +103,7 @@ class LayeredSnapshot:
         found: Reading | None = None
         for layer in self._layers.values():
             known = layer.geometry.channel(channel)
-            if known is None or (found is not None and not _is_alike(known, found.channel)):
+            if known is None or (found is not None and not are_alike(known, found.channel)):
                 continue
             read = layer.reading_at(points, channel)
             found = read if found is None else _filled(found, read)
@@ -135,21 +136,25 @@ class LayeredSnapshot:
         return cast_layers(self._cubes(), origins_m, directions, max_range_m=max_range_m)
 
     def nearest_occupied(self, points_m: npt.ArrayLike, *, radius_m: float) -> LayeredEnds:
-        """The nearest of the `occupied_in` of layers with cubes, for each of (N, 3) points, within a finite radius.
+        """The nearest occupied voxel of layers with cubes, for each of (N, 3) points, within a finite radius.
+
+        Of voxels that a finer layer of cubes shows its own count (`finest_voxels`). What gives way to a level counts:
+        a level has no distances.
 
         Raises:
             BadInputError: as `MapSnapshot.nearest_occupied`; kind `level_layer`: no layer has cubes.
         """
-        cubes, finest = self._cubes(), self._without_shown()
-        return nearest_of_layers({name: finest[name] for name in cubes}, points_m, radius_m=radius_m)
+        if self._finest_cubes is None:
+            self._finest_cubes = finest_states(self._cubes(), None)
+        return nearest_of_layers(self._finest_cubes, points_m, radius_m=radius_m)
 
     def occupied_in(self, box_m: Box | None = None) -> dict[str, Voxels]:
         """Occupied voxels in a box by layer, the finest first: those that no finer layer shows (`finest_voxels`)."""
-        return voxels_by_layer(self._without_shown(), box_m, occupied_only=True)
+        return voxels_by_layer(self._without_shown(box_m), box_m, occupied_only=True)
 
     def voxels_in(self, box_m: Box | None = None) -> dict[str, Voxels]:
         """All voxels with evidence in a box, as `occupied_in`."""
-        return voxels_by_layer(self._without_shown(), box_m, occupied_only=False)
+        return voxels_by_layer(self._without_shown(box_m), box_m, occupied_only=False)
 
     def layer_at(self, z_m: float, what: str = "probability", *, box_m: Box | None = None) -> MapImage:
         """A horizontal plane at a height, each pixel's centre by the finest layer that knows it, as an image.
@@ -162,14 +167,7 @@ class LayeredSnapshot:
         """
         ask = self._points_of(what)
         x, y, edge_m = self._pixels(box_m)
-        rows = max(1, point_queries.CHUNK // max(len(x), 1))
-        parts = []
-        for start in range(0, max(len(y), 1), rows):
-            columns = np.meshgrid(y[start : start + rows], x, indexing="ij")
-            points = np.stack([columns[1].ravel(), columns[0].ravel(), np.full(columns[0].size, z_m)], axis=1)
-            values = ask(points)
-            parts.append(values.reshape(*columns[0].shape, *values.shape[1:]))
-        return MapImage(np.concatenate(parts), _origin(x, y), edge_m)
+        return MapImage(plane_values(x, y, z_m, ask), _origin(x, y), edge_m)
 
     def _points_of(self, what: str) -> Callable[[Floats], npt.NDArray[Any]]:
         """Query that `layer_at` makes of each point: its state, probability, log odds, or the mean of a channel."""
@@ -192,7 +190,7 @@ class LayeredSnapshot:
         """
         x, y, edge_m = self._pixels(box_m)
         heights = np.full((len(y), len(x)), np.nan)
-        for frozen in self._without_shown().values():
+        for frozen in self._without_shown(box_m).values():
             image = region_queries.height_map(frozen, box_m)
             H, W = image.values.shape
             if not (H and W):
@@ -218,11 +216,14 @@ class LayeredSnapshot:
             check_cubes(next(iter(self._layers.values())).geometry)
         return found
 
-    def _without_shown(self) -> dict[str, FrozenMap]:
-        """`finest_states` of all layers, made once; two threads at a time make equal ones."""
-        if self._finest is None:
-            self._finest = finest_states({name: layer.frozen for name, layer in self._layers.items()})
-        return self._finest
+    def _without_shown(self, box_m: Box | None) -> dict[str, FrozenMap]:
+        """`finest_states` of all layers, in a box; of the whole map made once, and two threads make equal ones."""
+        if self._finest is not None:
+            return self._finest
+        found = finest_states({name: layer.frozen for name, layer in self._layers.items()}, box_m)
+        if box_m is None:
+            self._finest = found
+        return found
 
     def _pixels(self, box_m: Box | None) -> tuple[Floats, Floats, float]:
         """Centres along x and along y, and edge, of an image: of the finest layer with cells in a box.
@@ -239,7 +240,7 @@ class LayeredSnapshot:
         first = np.min([low[:2] * geometry.voxel_edge_um // edge_um for geometry, low, _ in spans], axis=0)
         end = np.max([-(-high[:2] * geometry.voxel_edge_um // edge_um) for geometry, _, high in spans], axis=0)
         check_pixels(first, end)
-        x, y = (centres(int(first[axis]), int(end[axis]), edge_um) for axis in (0, 1))
+        x, y = (pixel_centres(int(first[axis]), int(end[axis]), edge_um) for axis in (0, 1))
         if box_m is not None:
             box = np.asarray(box_m, np.float64)
             x, y = (each[(each >= box[0, axis]) & (each <= box[1, axis])] for axis, each in enumerate((x, y)))
@@ -275,10 +276,6 @@ class LayeredSnapshot:
 def _origin(x: Floats, y: Floats) -> tuple[float, float]:
     """Centre of the first pixel; of an image without pixels, the origin."""
     return (float(x[0]), float(y[0])) if len(x) and len(y) else (0.0, 0.0)
-
-
-def _is_alike(one: Channel, other: Channel) -> bool:
-    return (one.kind, one.unit, one.classes) == (other.kind, other.unit, other.classes)
 
 
 def _filled(fine: Reading, coarse: Reading) -> Reading:

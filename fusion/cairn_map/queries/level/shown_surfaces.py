@@ -59,12 +59,13 @@ def shown_surfaces(evidence: Evidence, geometry: Geometry, model: SensorModel) -
     # Stage 4: all votes of a window are its surface's.
     rows = np.nonzero(is_surface)[0]
     step = geometry.voxel_height_um / (1000 * HEIGHT_OFFSET.step)
-    heights = offsets + np.rint((keys - keys[0]) * step).astype(np.int64) * votes
-    merged = np.stack([_window_sums(heights, ends)[rows], _window_sums(votes, ends)[rows]], axis=1)
-    merged[:, 0] -= np.rint((keys[rows] - keys[0]) * step).astype(np.int64) * merged[:, 1]
+    faces = np.rint((keys % (geometry.side + WINDOW_BINS)) * step).astype(np.int64)  # over the cell's lower face
+    merged = np.stack([_window_sums(offsets + faces * votes, ends)[rows], _window_sums(votes, ends)[rows]], axis=1)
+    merged[:, 0] -= faces[rows] * merged[:, 1]
     odds = evidence.log_odds(model)[order]
-    highest = [odds[start:end].max() for start, end in zip(rows.tolist(), ends[rows].tolist(), strict=True)]
-    odds[rows] = highest
+    # From each surface's row to the end of its window, which may be the end of all rows, and from there to the next.
+    borders = np.stack([rows, ends[rows]], axis=1).ravel()
+    odds[rows] = np.maximum.reduceat(np.append(odds, -np.inf), borders)[::2]
     return _reading(evidence, order, rows, is_shown, merged, odds, planes)
 
 

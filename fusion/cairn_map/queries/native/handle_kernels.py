@@ -20,7 +20,8 @@ from numba.core import types
 from numba.extending import intrinsic
 from numba.np.numpy_support import carray
 
-from cairn_map.queries.occupancy_kernels import NONE, UNKNOWN, Grid, U, place_of, slot_of, state_in, voxel_of
+from cairn_map.kernels.integer_kernels import U
+from cairn_map.queries.occupancy_kernels import NONE, UNKNOWN, Grid, place_of, slot_of, state_in, voxel_of
 
 SLOT_BITS, GENERATION_BITS = 6, 22
 """A slot's address is a multiple of 2^6, its generation less than 2^22; both are one number of 64 bits."""

@@ -9,9 +9,9 @@ number are refused: it holds an address that is never freed, and a generation th
 """
 
 import os
-import threading
 import time
 import weakref
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
@@ -36,29 +36,32 @@ GENERATIONS = 1 << kernels.GENERATION_BITS
 
 
 class _Slots:
-    """The slots of this process, which stay where they are until it ends, and the generation of each."""
+    """The slots of this process, which stay where they are until it ends, and the generation of each.
+
+    There is no lock: a finalizer, which gives a slot back, runs wherever Python collects garbage, so in the middle of
+    `take`, too, in the thread that would hold the lock. Appending to a deque and popping from it are atomic.
+    """
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
         self._all: list[Slot] = []
-        self._free: list[tuple[Slot, int]] = []
+        self._free: deque[tuple[Slot, int]] = deque()
 
     def take(self) -> tuple[Slot, int]:
         """A slot that is closed, and its next generation."""
-        with self._lock:
-            if not self._free:
+        while True:
+            try:
+                return self._free.pop()
+            except IndexError:
                 words = np.zeros((SLOTS_MADE + 1) * SLOT_WORDS, np.uint64)
                 first = -(words.ctypes.data // words.itemsize) % SLOT_WORDS
                 self._all.append(words)
                 made = words[first:][: SLOTS_MADE * SLOT_WORDS].reshape(SLOTS_MADE, SLOT_WORDS)
-                self._free = [(slot, 1) for slot in made]
-            return self._free.pop()
+                self._free.extend((slot, 1) for slot in made)
 
     def give_back(self, slot: Slot, generation: int) -> None:
         """Take a slot back that no call is in; after its last generation it is not used again."""
         if generation + 1 < GENERATIONS:
-            with self._lock:
-                self._free.append((slot, generation + 1))
+            self._free.append((slot, generation + 1))
 
 
 _SLOTS = _Slots()
@@ -135,10 +138,11 @@ class PointHandle:
 
 def _close(slot: Slot, generation: int, process: int, held: tuple[npt.NDArray[np.uint64], list[Grid]]) -> None:
     """Close a slot; the arrays in `held` are needed until then."""
-    # In a forked process the calls of other threads do not go on, and are counted for ever.
-    while not kernels.close_slot(slot.ctypes.data) and process == os.getpid():
+    # In a forked process the calls of other threads do not go on, and are counted for ever: such a slot is left alone.
+    while not (is_left := kernels.close_slot(slot.ctypes.data)) and process == os.getpid():
         time.sleep(0)
-    _SLOTS.give_back(slot, generation)
+    if is_left:
+        _SLOTS.give_back(slot, generation)
 
 
 def _row(frozen: FrozenMap) -> npt.NDArray[np.uint64]:

@@ -1,5 +1,7 @@
 """Rays, distances, images and sets of voxels of several layers: as slow readers of all their voxels find them."""
 
+import tracemalloc
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -12,7 +14,7 @@ from cairn_map.errors import BadInputError
 from cairn_map.evidence.channels import COLOUR, TEMPERATURE
 from cairn_map.evidence.evidence import Evidence, packed_evidence
 from cairn_map.evidence.grid import CellKey, Geometry, cell_key, level_geometry, split_voxels
-from cairn_map.queries.layers.finest_voxels import joined_layers
+from cairn_map.queries.layers.finest_voxels import finest_states, joined_layers
 from cairn_map.queries.layers.layered_snapshot import LayeredSnapshot
 from cairn_map.queries.map_snapshot import MapSnapshot, snapshot_of
 from cairn_map.queries.occupancy_states import State
@@ -52,7 +54,9 @@ def counted(geometry: Geometry, counts: dict[Number, tuple[int, int]]) -> dict[C
         mine = np.nonzero(cells == cell)[0]
         mine = mine[np.argsort(places[mine])]
         rows = np.array(list(counts.values()))[mine]
-        found[CellKey(int(cell))] = packed_evidence(places[mine], rows, np.empty((len(mine), 0), np.int64), geometry)
+        found[CellKey(int(cell))] = packed_evidence(
+            places[mine], rows, np.zeros((len(mine), geometry.plane_count), np.int64), geometry
+        )
     return found
 
 
@@ -113,6 +117,58 @@ def test_voxels_of_a_coarser_layer_give_way_to_what_finer_ones_show(layers: Laye
     assert all(len(layers[name].occupied_in()) >= len(voxels) for name, voxels in occupied.items())
 
 
+def test_voxels_give_way_to_a_level_s_flat_ones() -> None:
+    level = level_geometry(voxel_edge_m=0.1).model_copy(update={"depth": 3})
+    assert (level.voxel_edge_um, level.voxel_height_um) == (100_000, 50_000)
+    # All 2 x 2 x 4 flat voxels of the first cube are free, all but one of the second; one of the third is occupied.
+    corner = [(x, y, z) for x in range(2) for y in range(2) for z in range(4)]
+    free = [*corner, *((x + 2, y, z) for x, y, z in corner[:-1])]
+    ground = HistoryMap(MapLayer(geometry=level))
+    ground.merge(counted(level, dict.fromkeys(free, (0, 5)) | {(4, 0, 3): (5, 0)}))
+    cubes = HistoryMap(MapLayer(geometry=Geometry(voxel_edge_um=200_000, depth=3, channels=())))
+    cubes.merge(counted(cubes.geometry, {(x, 0, z): (5, 0) for x in range(3) for z in range(2)}))
+    layers = LayeredSnapshot({"ground": snapshot_of(ground), "cubes": snapshot_of(cubes)})
+    assert layers.occupied_in()["cubes"].numbers.tolist() == [[1, 0, 0], [0, 0, 1], [1, 0, 1], [2, 0, 1]]
+
+
+@pytest.fixture(scope="module")
+def full() -> dict[str, MapSnapshot]:
+    """Two layers of one cell, of which each of the 32 768 voxels is free."""
+    found = {}
+    for edge_um in (20_000, 30_000):
+        geometry = Geometry(voxel_edge_um=edge_um, depth=5, channels=())
+        whole = HistoryMap(MapLayer(geometry=geometry))
+        places = np.arange(8**5, dtype=np.uint32)
+        samples = np.empty((len(places), 0), np.int64)
+        whole.merge(
+            {cell_key((0, 0, 0)): packed_evidence(places, np.tile([0, 1], (len(places), 1)), samples, geometry)}
+        )
+        found[f"at_{edge_um}"] = snapshot_of(whole)
+    return found
+
+
+def test_finest_voxels_take_less_memory_than_a_byte_for_each_voxel(full: dict[str, MapSnapshot]) -> None:
+    LayeredSnapshot(full).nearest_occupied(np.zeros((1, 3)), radius_m=0.1)  # kernels may be compiled now
+    tracemalloc.start()
+    LayeredSnapshot(full).nearest_occupied(np.zeros((1, 3)), radius_m=0.1)
+    peak_bytes = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak_bytes < 2 * 8**5
+
+
+def test_voxels_out_of_a_box_are_not_looked_at(full: dict[str, MapSnapshot]) -> None:
+    box = [[0.3, 0.3, 0.3], [0.4, 0.4, 0.4]]
+    frozen = {name: layer.frozen for name, layer in full.items()}
+    before, after, whole = (
+        finest["at_30000"].grid.words for finest in (frozen, finest_states(frozen, box), finest_states(frozen, None))
+    )
+    changed = (after != before).any(axis=(1, 2))
+    # Voxels 10 to 12 along each axis lie in the second of four bricks. That with its neighbours is known finer whole.
+    assert np.unique(frozen["at_30000"].brick_corners()[changed], axis=0).tolist() == [[8, 8, 8]]
+    np.testing.assert_array_equal(after[changed], whole[changed])
+    assert ((whole != before).any(axis=(1, 2))).sum() > 1
+
+
 def test_no_obstacle_vanishes(layers: LayeredSnapshot) -> None:
     occupied = {name: voxels.numbers.tolist() for name, voxels in layers.occupied_in().items()}
     for n, name in enumerate(layers.names):
@@ -169,6 +225,43 @@ def test_a_ray_passes_the_free_part_of_a_coarse_obstacle_and_ends_in_the_rest() 
     assert layers.cast_rays([0.005, 0.005, 0.005], [1, 0, 0], max_range_m=0.14).hit.tolist() == [False]
 
 
+def nested(*counts: dict[Number, tuple[int, int]]) -> LayeredSnapshot:
+    """Layers of 1, 2 and 4 cm with these hits and misses."""
+    found = {}
+    for edge_um, mine in zip((10_000, 20_000, 40_000), counts, strict=True):
+        whole = HistoryMap(MapLayer(geometry=Geometry(voxel_edge_um=edge_um, depth=3, channels=())))
+        whole.merge(counted(whole.geometry, mine))
+        found[f"at_{edge_um // 10_000}_cm"] = snapshot_of(whole)
+    return LayeredSnapshot(found)
+
+
+def test_a_ray_through_a_free_voxel_ends_at_an_obstacle_of_a_finer_layer_in_it() -> None:
+    layers = nested({(5, 0, 0): (5, 0)}, {(2, 0, 0): (0, 5)}, {(1, 0, 0): (5, 0)})
+    ends = layers.cast_rays([0.005, 0.005, 0.005], [1, 0, 0], max_range_m=1.0)
+    np.testing.assert_allclose(ends.distance_m, [0.045], atol=1e-6)
+    assert ends.names == ["at_1_cm"]
+
+
+def test_rays_end_at_the_first_obstacle_of_layers_nested_in_each_other() -> None:
+    chance = np.random.default_rng(11)
+    for _ in range(10):
+        # Rows of voxels along x: each layer knows half of its own, and has two thirds of these as free.
+        worlds: list[dict[Number, tuple[int, int]]] = [
+            {(x, 0, 0): (0, 5) if chance.random() < 0.67 else (5, 0) for x in range(size) if chance.random() < 0.5}
+            for size in (64, 32, 16)
+        ]
+        layers = nested(*worlds)
+        middles = np.stack([np.arange(64) * 0.01 + 0.005, *np.full((2, 64), 0.005)], axis=1)
+        met, names = layers.state_at(middles) == State.OCCUPIED, layers.names_at(middles)
+        for ways, rows in (([1, 0, 0], range(64)), ([-1, 0, 0], range(63, -1, -1))):
+            ends = layers.cast_rays(middles, ways, max_range_m=1.0)
+            for n in range(64):
+                first = next((row for row in rows if met[row] and (row - n) * ways[0] >= 0), None)
+                expected_m = np.inf if first is None else max(abs(first - n) * 0.01 - 0.005, 0)
+                np.testing.assert_allclose(ends.distance_m[n], expected_m, atol=1e-6)
+                assert ends.names[n] == (None if first is None else names[first])
+
+
 def test_the_nearest_obstacle_is_of_what_no_finer_layer_shows(layers: LayeredSnapshot) -> None:
     points = np.random.default_rng(6).uniform(-1, 1, (50, 3))
     shown = layers.occupied_in()
@@ -187,6 +280,21 @@ def test_the_nearest_obstacle_is_of_what_no_finer_layer_shows(layers: LayeredSna
     np.testing.assert_allclose(
         np.linalg.norm(found.points_m - points, axis=1)[found.hit], expected[found.hit], atol=2e-9
     )
+
+
+def test_obstacles_that_give_way_to_a_level_are_still_near() -> None:
+    """A level has no distances: what it shows in the place of a cube stops no planner."""
+    level = level_geometry(voxel_edge_m=0.1).model_copy(update={"depth": 3})
+    ground = HistoryMap(MapLayer(geometry=level))
+    ground.merge(counted(level, {(0, 0, 0): (5, 0)}))
+    cubes = HistoryMap(MapLayer(geometry=Geometry(voxel_edge_um=200_000, depth=3, channels=())))
+    cubes.merge(counted(cubes.geometry, {(0, 0, 0): (5, 0), (3, 0, 0): (5, 0)}))
+    layers = LayeredSnapshot({"ground": snapshot_of(ground), "cubes": snapshot_of(cubes)})
+    assert layers.names == ("ground", "cubes")
+    assert layers.occupied_in()["cubes"].numbers.tolist() == [[3, 0, 0]]
+    found = layers.nearest_occupied([[-0.1, 0.1, 0.1]], radius_m=1.0)
+    np.testing.assert_allclose(found.distance_m, [0.1], atol=1e-9)
+    assert found.names == ["cubes"]
 
 
 def test_images_have_the_pixels_of_the_finest_layer_there(layers: LayeredSnapshot) -> None:
@@ -228,6 +336,21 @@ def test_layers_make_one_table(layers: LayeredSnapshot) -> None:
             own = part.readings.get(channel)
             assert reading.weight[rows].tolist() == ([0] * len(part) if own is None else own.weight.tolist())
             assert own is not None or layers[name].geometry.channel(channel) is None
+
+
+def test_a_table_has_times_if_any_layer_has_some() -> None:
+    first, second, *_ = world("cubes in cubes").occupied_in().values()
+    kelvin = second.readings["temperature"]
+    dated = replace(second, readings={"temperature": replace(kelvin, measured_s=np.arange(len(second)) + 0.5)})
+    for parts in ([first, dated], [dated, first]):
+        table = joined_layers(parts)
+        for reading in table.readings.values():
+            assert reading.measured_s is not None
+            assert len(reading.measured_s) == len(table)
+        expected = np.concatenate(
+            [np.arange(len(part)) + 0.5 if part is dated else [np.nan] * len(part) for part in parts]
+        )
+        np.testing.assert_array_equal(table.readings["temperature"].measured_s, expected)
 
 
 def test_a_level_is_in_sets_and_images_and_not_in_rays() -> None:
