@@ -16,11 +16,11 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_calib.rig.rig import Rig
-from cairn_fusion.mapping.beam_returns import Returns
+from cairn_fusion.mapping.beam_returns import Returns, sigmas_of_pixels
 from cairn_fusion.mapping.sample_kernels import add_pixels_into, doubt_edges_into, write_means_into
 from cairn_fusion.recording.scan import Scan
 from cairn_fusion.transfer.pixel_covariance import PlaceBounds, spread_m
-from cairn_fusion.transfer.transfer import Label, Transfer, transfer_points
+from cairn_fusion.transfer.transfer import CameraPair, Label, Transfer, transfer_points
 from cairn_fusion.transfer.transfer_kernels import examine_into, points_of_pixels
 from cairn_map.arrays import Flags, Floats, Int32s, Ints
 from cairn_map.evidence.channels import Channel, ChannelKind
@@ -63,14 +63,15 @@ class Sampling:
         self.rig = rig
         self.geometry = geometry
         self.limits = limits
-        self._bounds: dict[tuple[str, str], PlaceBounds] = {}
+        self._pairs: dict[tuple[str, str], tuple[CameraPair, PlaceBounds]] = {}
 
-    def bounds(self, *, src: str, dst: str) -> PlaceBounds:
-        """Bounds for the samples of a camera; computed once for each pair."""
+    def pair(self, *, src: str, dst: str) -> tuple[CameraPair, PlaceBounds]:
+        """A pair of cameras, and bounds for the samples of `dst`; computed once."""
         # Two threads at once compute equal ones.
-        if (src, dst) not in self._bounds:
-            self._bounds[src, dst] = PlaceBounds.of(self.rig, src=src, dst=dst)
-        return self._bounds[src, dst]
+        if (src, dst) not in self._pairs:
+            bounds = PlaceBounds.of(self.rig, src=src, dst=dst)
+            self._pairs[src, dst] = CameraPair.of(self.rig, src=src, dst=dst), bounds
+        return self._pairs[src, dst]
 
 
 class ImageTransfers:
@@ -132,16 +133,9 @@ class ImageTransfers:
             voxel_of: (N,) number of each point's voxel.
         """
         src, limits = self._scan.range_camera, self._sampling.limits
-        points, bounds = self._seen_points(), self._sampling.bounds(src=src, dst=name)
+        points, (pair, bounds) = self._seen_points(), self._sampling.pair(src=src, dst=name)
         # Stage 1: Eq. 5-6 and the z-buffer.
-        transfer = transfer_points(
-            points.tof,
-            self._rig,
-            src=src,
-            dst=name,
-            steps_m=points.steps_m,
-            hidden_behind_m=limits.hidden_behind_m,
-        )
+        transfer = transfer_points(points.tof, pair, steps_m=points.steps_m, hidden_behind_m=limits.hidden_behind_m)
         # Stage 2: the covariance of the place, only for points that a bound does not clear. Those that need no sample
         # hide others, and are examined no further.
         labels, doubtful = transfer.labels, np.empty(len(transfer.labels), np.int32)
@@ -163,7 +157,7 @@ class ImageTransfers:
         if self._points is None:
             mounted, returned, image_m = self._rig[self._scan.range_camera], self._returns.pixels, self._returns.range_m
             tof, range_m, steps_m = points_of_pixels(image_m, mounted.camera.rays(), returned)
-            sigma_m = mounted.range_sigma_image(image_m).ravel()[returned]
+            sigma_m = sigmas_of_pixels(mounted, image_m, returned, range_m)
             self._points = _Points(tof, range_m, steps_m, sigma_m)
         return self._points
 
