@@ -114,7 +114,9 @@ def returns_of(
     check_scan(scan, rig)
     mounted = rig[scan.range_camera]
     max_range_m = mounted.usual_reach_m if max_range_m is None else max_range_m
-    true_m = mounted.true_ranges(scan.range_m, scan.amplitude)
+    true_m = np.ascontiguousarray(mounted.true_ranges(scan.range_m, scan.amplitude)).view()
+    # Read-only, as the images of kept scans are: one kind of array, and one kernel to compile.
+    true_m.flags.writeable = False
     T_map_tof = scan.T_map_rig @ mounted.transform
     # Hits: within limits, not saturated; `shield_m` is taken before flying pixels and the body are left out.
     is_flying = flying_pixels(true_m, flying_step_m) if flying_step_m < math.inf else np.zeros(true_m.shape, bool)

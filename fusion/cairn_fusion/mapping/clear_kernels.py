@@ -87,7 +87,7 @@ def sort_ranges_into(
 
 @nb.njit(cache=True, nogil=True)
 def interpolated(values: npt.NDArray[np.floating], nodes: Floats) -> Floats:
-    """(N,) what `np.interp` gives between (2, K) nodes: NaN for NaN."""
+    """(N,) values between (2, K) nodes, as `np.interp` gives them, and NaN for NaN."""
     last = nodes.shape[1] - 1
     out = np.empty(len(values))
     for n in range(len(values)):
