@@ -40,6 +40,7 @@ class Window:
 
     def shown(self, clear_m: Singles) -> Singles:
         """(height + 2, width + 2) clear range of each pixel of the window, from (H, W) of the camera; 0 around it."""
+        # The number past the last is that of pixels outside the camera's image: never clear.
         return shown_in_window(clear_m, self.pixel_of, self.height, self.width)
 
 
@@ -142,6 +143,7 @@ def carving_of(
     corner_m: Floats = corner.astype(np.float64) * voxel_edge_m
     # Stage 1: the bricks around the eye that the longest beam reaches, a tenth of a brick more for rounding.
     reach_m = float(clear_m.max())
+    # Plain numbers: arrays of three take NumPy ten times as long.
     brick_m, from_corner_m, last = BRICK_VOXELS * voxel_edge_m, (t - corner_m).tolist(), (dims - 1).tolist()
     firsts = [math.floor((x - reach_m) / brick_m - 0.1) for x in from_corner_m]
     lasts = [math.floor((x + reach_m) / brick_m + 0.1) for x in from_corner_m]

@@ -125,6 +125,7 @@ class CameraPair:
         """The pair of the range camera `src` and the camera `dst`."""
         T_dst_src, seen_by = inverse(rig[dst].transform) @ rig[src].transform, rig[dst].camera
         pinhole = bins = None
+        # Eq. 6: the kernel knows the lens that nearly all cameras have.
         if isinstance(seen_by, Camera) and len(seen_by.distortion) == KERNEL_COEFFICIENTS:
             lens, coefficients = np.array([*seen_by.focal_px, *seen_by.centre_px]), np.array(seen_by.distortion)
             limit = _square_limit(radius_limit(seen_by.distortion))
@@ -177,6 +178,7 @@ def transfer_points(
 @lru_cache(maxsize=64)
 def _square_limit(radius: float) -> float:
     """The least square whose root, as it is rounded, is not less than a radius: no root need be taken of each point."""
+    # From below, step by step: the product is at most a few steps off.
     square = radius * radius
     while math.sqrt(square) >= radius:
         square = math.nextafter(square, 0.0)

@@ -54,14 +54,9 @@ def build_into(
                 key = np.int64(voxels[n]) >> 6
                 _add_child(children, leaves, alike, counts, depth - 3, key & 7, n)
                 n += BLOCK
-                key >>= 3
                 after = np.int64(voxels[n]) >> 9 if n < V else -1
-                d = depth - 3
-                while d >= 0 and key != after:
-                    count -= _close_into(children, leaves, alike, counts, child_masks, leaf_masks, masks, d, key & 7)
-                    d -= 1
-                    key >>= 3
-                    after = after >> 3 if after >= 0 else -1
+                nodes = (children, leaves, alike, counts, child_masks, leaf_masks, masks)
+                count -= _close_all_into(nodes, depth - 3, key >> 3, after)
                 continue
         # The voxels [n, end) of one parent; `fixed` if one of them has samples.
         parent = voxels[n] >> np.uint32(3)
@@ -88,14 +83,9 @@ def build_into(
                 _add_child(children, leaves, alike, counts, depth - 2, np.int64(parent) & 7, NO_ROW)
         n = end
         # Close the open nodes that do not hold the next voxel, from the deepest up.
-        d = depth - 2
-        key = np.int64(parent) >> 3
         after = np.int64(voxels[n]) >> 6 if n < V else -1
-        while d >= 0 and key != after:
-            count -= _close_into(children, leaves, alike, counts, child_masks, leaf_masks, masks, d, key & 7)
-            d -= 1
-            key >>= 3
-            after = after >> 3 if after >= 0 else -1
+        nodes = (children, leaves, alike, counts, child_masks, leaf_masks, masks)
+        count -= _close_all_into(nodes, depth - 2, np.int64(parent) >> 3, after)
     return count
 
 
@@ -110,6 +100,24 @@ def _is_block(voxels: Words32, counts: Int32s, n: int) -> bool:
     for m in range(n, n + BLOCK):
         different |= (counts[m, 0] ^ hits) | (counts[m, 1] ^ misses)
     return bool(different == 0)
+
+
+@nb.njit(nogil=True, forceinline=True)
+def _close_all_into(
+    nodes: tuple[Bytes, Bytes, Ints, Int32s, Bytes, Bytes, Ints], d: int, key: int | np.int64, after: int | np.int64
+) -> int:
+    """Close the open nodes from depth d up that do not hold the next row; returns the number of leaves that vanish.
+
+    `key` is the number of the open node of depth d, `after` that of the one which holds the next row, -1 for none.
+    """
+    children, leaves, alike, counts, child_masks, leaf_masks, masks = nodes
+    vanished = 0
+    while d >= 0 and key != after:
+        vanished += _close_into(children, leaves, alike, counts, child_masks, leaf_masks, masks, d, key & 7)
+        d -= 1
+        key >>= 3
+        after = after >> 3 if after >= 0 else -1
+    return vanished
 
 
 @nb.njit(nogil=True, forceinline=True)
