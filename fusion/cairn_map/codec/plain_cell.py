@@ -122,6 +122,9 @@ def plain_bytes(key: CellKey, evidence: Evidence, geometry: Geometry) -> PlainBy
     # One kind of array, whatever the evidence was made of: each other kind is another kernel to compile.
     voxels, counts = _readable(evidence.voxels), _readable(evidence.counts)
     sampled, samples = _readable(evidence.sampled), _readable(evidence.samples)
+    count_bits = stream_kernels.bits_of_counts(counts)
+    if min(count_bits) < 0:
+        return None
     # Masks, and the row at which each leaf begins.
     depth, V = geometry.depth, len(voxels)
     room = min(V, 8 ** (depth - 1))
@@ -129,10 +132,6 @@ def plain_bytes(key: CellKey, evidence: Evidence, geometry: Geometry) -> PlainBy
     masks, rows_of_leaves = np.zeros(depth, np.int64), large_empty(V, np.int64)
     leaves = octree_kernels.build_into(voxels, counts, sampled, child_masks, leaf_masks, masks, rows_of_leaves)
     leaf_rows = rows_of_leaves[:leaves]
-    # Each voxel has the counts of its leaf.
-    count_bits = stream_kernels.bits_of_counts(counts, leaf_rows)
-    if min(count_bits) < 0:
-        return None
     # Words of the channels, of which the sizes of their streams follow.
     spec = planes_and_squares(geometry.channels)
     presence = np.zeros((len(spec), (leaves + 7) // 8), np.uint8)

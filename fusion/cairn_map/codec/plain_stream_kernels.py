@@ -22,13 +22,12 @@ Presence = npt.NDArray[np.uint8]
 
 
 @nb.njit(cache=True, nogil=True)
-def bits_of_counts(counts: Int32s, leaf_rows: Ints) -> tuple[int, int]:
-    """All bits of the hits, and of the misses, in some rows; negative if one of them is."""
+def bits_of_counts(counts: Int32s) -> tuple[int, int]:
+    """All bits of the hits, and of the misses; negative if one of them is."""
     hits, misses = np.int32(0), np.int32(0)
-    for n in range(leaf_rows.shape[0]):
-        row = np.uint64(leaf_rows[n])
-        hits |= counts[row, 0]
-        misses |= counts[row, 1]
+    for n in range(counts.shape[0]):
+        hits |= counts[n, 0]
+        misses |= counts[n, 1]
     return int(hits), int(misses)
 
 

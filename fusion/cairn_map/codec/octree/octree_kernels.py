@@ -14,8 +14,6 @@ from cairn_map.arrays import Bytes, Int32s, Ints, Words32
 
 NO_ROW = -1
 """In place of a row: an inner node."""
-BLOCK = 64
-"""Voxels of a node two depths above theirs."""
 
 
 @nb.njit(cache=True, nogil=True)
@@ -44,20 +42,6 @@ def build_into(
     s = 0
     n = 0
     while n < V:
-        if depth > 2 and _is_block(voxels, counts, n):
-            while s < sampled.shape[0] and sampled[s] < n:
-                s += 1
-            if s == sampled.shape[0] or sampled[s] >= n + BLOCK:
-                # All voxels of a node two depths above theirs are alike: it is one leaf, and its children need no look.
-                leaf_rows[count] = n
-                count += 1
-                key = np.int64(voxels[n]) >> 6
-                _add_child(children, leaves, alike, counts, depth - 3, key & 7, n)
-                n += BLOCK
-                after = np.int64(voxels[n]) >> 9 if n < V else -1
-                nodes = (children, leaves, alike, counts, child_masks, leaf_masks, masks)
-                count -= _close_all_into(nodes, depth - 3, key >> 3, after)
-                continue
         # The voxels [n, end) of one parent; `fixed` if one of them has samples.
         parent = voxels[n] >> np.uint32(3)
         end = n + 1
@@ -83,41 +67,15 @@ def build_into(
                 _add_child(children, leaves, alike, counts, depth - 2, np.int64(parent) & 7, NO_ROW)
         n = end
         # Close the open nodes that do not hold the next voxel, from the deepest up.
+        d = depth - 2
+        key = np.int64(parent) >> 3
         after = np.int64(voxels[n]) >> 6 if n < V else -1
-        nodes = (children, leaves, alike, counts, child_masks, leaf_masks, masks)
-        count -= _close_all_into(nodes, depth - 2, np.int64(parent) >> 3, after)
+        while d >= 0 and key != after:
+            count -= _close_into(children, leaves, alike, counts, child_masks, leaf_masks, masks, d, key & 7)
+            d -= 1
+            key >>= 3
+            after = after >> 3 if after >= 0 else -1
     return count
-
-
-@nb.njit(nogil=True, forceinline=True)
-def _is_block(voxels: Words32, counts: Int32s, n: int) -> bool:
-    """True if the rows from n on are all voxels of a node two depths above theirs, with equal counts."""
-    first, last = voxels[n], n + BLOCK - 1
-    # Rows rise, so the last voxel of the node has this row only if no voxel is missing.
-    if first & np.uint32(BLOCK - 1) != 0 or last >= voxels.shape[0] or voxels[last] != first + np.uint32(BLOCK - 1):
-        return False
-    hits, misses, different = counts[n, 0], counts[n, 1], np.int32(0)
-    for m in range(n, n + BLOCK):
-        different |= (counts[m, 0] ^ hits) | (counts[m, 1] ^ misses)
-    return bool(different == 0)
-
-
-@nb.njit(nogil=True, forceinline=True)
-def _close_all_into(
-    nodes: tuple[Bytes, Bytes, Ints, Int32s, Bytes, Bytes, Ints], d: int, key: int | np.int64, after: int | np.int64
-) -> int:
-    """Close the open nodes from depth d up that do not hold the next row; returns the number of leaves that vanish.
-
-    `key` is the number of the open node of depth d, `after` that of the one which holds the next row, -1 for none.
-    """
-    children, leaves, alike, counts, child_masks, leaf_masks, masks = nodes
-    vanished = 0
-    while d >= 0 and key != after:
-        vanished += _close_into(children, leaves, alike, counts, child_masks, leaf_masks, masks, d, key & 7)
-        d -= 1
-        key >>= 3
-        after = after >> 3 if after >= 0 else -1
-    return vanished
 
 
 @nb.njit(nogil=True, forceinline=True)
