@@ -41,8 +41,8 @@ def check_transform(
         raise BadInputError("bad_transform", f"{name} must end in the row 0 0 0 1, got {T[3].tolist()}")
     R = T[:3, :3]
     deviation = rotation_deviation(R)
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        det = float(np.linalg.det(R))
+    a, b, c = R.tolist()
+    det = a[0] * (b[1] * c[2] - b[2] * c[1]) - a[1] * (b[0] * c[2] - b[2] * c[0]) + a[2] * (b[0] * c[1] - b[1] * c[0])
     # Not `deviation > ...`: of numbers beyond 1e154 it may be NaN.
     if not deviation <= tolerance or det < 0:
         raise BadInputError(
@@ -97,18 +97,24 @@ def transform_from_quaternion(t: npt.ArrayLike, q_xyzw: npt.ArrayLike) -> Transf
 
 def quaternion_from_transform(T_dst_src: Transform) -> npt.NDArray[np.float64]:
     """Unit quaternion x y z w of the rotation, w >= 0; the mirror of `transform_from_quaternion`."""
-    R = T_dst_src[:3, :3]
+    q: npt.NDArray[np.float64] = quaternions_from_transforms(T_dst_src[None])[0]
+    return q
+
+
+def quaternions_from_transforms(T_dst_src: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """(N, 4) of `quaternion_from_transform` for (N, 4, 4) transforms."""
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = np.moveaxis(T_dst_src[:, :3, :3], 0, 2)
     # Bar-Itzhack: the quaternion is the eigenvector of K to its largest eigenvalue; no case split, no cancellation.
     K = np.array(
         [
-            [R[0, 0] - R[1, 1] - R[2, 2], R[0, 1] + R[1, 0], R[0, 2] + R[2, 0], R[2, 1] - R[1, 2]],
-            [R[0, 1] + R[1, 0], R[1, 1] - R[0, 0] - R[2, 2], R[1, 2] + R[2, 1], R[0, 2] - R[2, 0]],
-            [R[0, 2] + R[2, 0], R[1, 2] + R[2, 1], R[2, 2] - R[0, 0] - R[1, 1], R[1, 0] - R[0, 1]],
-            [R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1], R[0, 0] + R[1, 1] + R[2, 2]],
+            [xx - yy - zz, xy + yx, xz + zx, zy - yz],
+            [xy + yx, yy - xx - zz, yz + zy, xz - zx],
+            [xz + zx, yz + zy, zz - xx - yy, yx - xy],
+            [zy - yz, xz - zx, yx - xy, xx + yy + zz],
         ]
     )
-    q = np.linalg.eigh(K)[1][:, 3]
-    return -q if q[3] < 0 else q
+    q = np.linalg.eigh(np.moveaxis(K, 2, 0))[1][:, :, 3]
+    return np.asarray(np.where(q[:, 3:] < 0, -q, q))
 
 
 def look_at(eye: npt.ArrayLike, target: npt.ArrayLike, *, up: npt.ArrayLike = (0.0, 0.0, 1.0)) -> Transform:

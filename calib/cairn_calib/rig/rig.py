@@ -69,8 +69,11 @@ class RangeSensing(BaseModel):
 
     def sigma_at(self, range_m: npt.NDArray[np.floating], *, usual: "RangeSensing") -> npt.NDArray[np.float64]:
         """(...) standard deviation at ranges, metres; by `usual` where this one does not say; NaN for NaN."""
-        nodes = np.array(self.sigma_m or usual.sigma_m or ((0.0, 0.0),), dtype=np.float64)
-        return np.asarray(np.interp(range_m, nodes[:, 0], nodes[:, 1]))
+        return np.asarray(np.interp(range_m, *self.sigma_nodes(usual=usual)))
+
+    def sigma_nodes(self, *, usual: "RangeSensing") -> npt.NDArray[np.float64]:
+        """(2, K) ranges, rising, and the standard deviation there, metres: linear between, constant beyond."""
+        return np.array(self.sigma_m or usual.sigma_m or ((0.0, 0.0),), dtype=np.float64).T.copy()
 
 
 TIME_OF_FLIGHT = RangeSensing(sigma_m=((0.0, 0.005), (3.0, 0.01), (6.0, 0.03)))
@@ -203,8 +206,12 @@ class MountedCamera(BaseModel, frozen=True):
 
     def range_noise_m(self, range_m: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
         """(...) standard deviation at ranges, metres, without the bias: independent from pixel to pixel."""
-        usual = LIDAR if isinstance(self.camera, SpinningLidar) else TIME_OF_FLIGHT
-        return self.known_sensing.sigma_at(range_m, usual=usual)
+        return np.asarray(np.interp(range_m, *self.range_noise_nodes))
+
+    @property
+    def range_noise_nodes(self) -> npt.NDArray[np.float64]:
+        """(2, K) ranges, rising, and the standard deviation there without the bias, metres: linear between."""
+        return self.known_sensing.sigma_nodes(usual=LIDAR if isinstance(self.camera, SpinningLidar) else TIME_OF_FLIGHT)
 
     def true_ranges(
         self, range_m: npt.NDArray[Real], amplitude: npt.NDArray[np.generic] | None = None

@@ -17,16 +17,21 @@ import math
 from dataclasses import dataclass, fields
 
 import numpy as np
-import numpy.typing as npt
 
 from cairn_calib.rig.body import Body
 from cairn_calib.rig.poses import Transform, inverse, transform_points
 from cairn_calib.rig.rig import MountedCamera, Rig
 from cairn_fusion.mapping.brick_tally_kernels import returned_points
-from cairn_fusion.mapping.clear_kernels import bridge_gaps_into, nearest_around
+from cairn_fusion.mapping.clear_kernels import (
+    bridge_gaps_into,
+    interpolated,
+    nearest_around,
+    sort_ranges_into,
+    stay_before_into,
+)
 from cairn_fusion.mapping.flying_kernels import flying_pixels
 from cairn_fusion.recording.scan import Scan, check_scan
-from cairn_map.arrays import Flags, Floats, Singles
+from cairn_map.arrays import Flags, Floats, Int32s, Singles
 
 MARGIN_VOXELS = 1.0
 """Distance of a free voxel's centre from a surface, voxels: a little more than half a voxel's diagonal, 0.87."""
@@ -82,17 +87,13 @@ class Returns:
     """Clear length of silent beams, metres."""
     missing: Flags
     """(H, W) true where nothing came back and the rig does not say what that means."""
-    pixels: npt.NDArray[np.int32]
+    pixels: Int32s
     """(N,) numbers of the pixels with a range, row by row."""
     points_map: Floats
     """(N, 3) metres, map frame."""
     counts: ReturnCounts
-
-    @property
-    def reach_m(self) -> float:
-        """Length of the longest beam with information, metres; 0 without any."""
-        farthest_m = float(np.nanmax(self.range_m)) if len(self.pixels) else 0.0
-        return max(farthest_m, self.silent_m if self.silent.any() else 0.0)
+    reach_m: float
+    """Length of the longest beam with information, metres; 0 without any."""
 
 
 def returns_of(
@@ -113,40 +114,47 @@ def returns_of(
     check_scan(scan, rig)
     mounted = rig[scan.range_camera]
     max_range_m = mounted.usual_reach_m if max_range_m is None else max_range_m
-    true_m = mounted.true_ranges(scan.range_m, scan.amplitude)
+    true_m = np.ascontiguousarray(mounted.true_ranges(scan.range_m, scan.amplitude)).view()
+    # Read-only, as the images of kept scans are: one kind of array, and one kernel to compile.
+    true_m.flags.writeable = False
     T_map_tof = scan.T_map_rig @ mounted.transform
     # Hits: within limits, not saturated; `shield_m` is taken before flying pixels and the body are left out.
-    full = full_pixels(scan, mounted)
-    near, far, void = true_m < min_range_m, true_m > max_range_m, np.isnan(true_m)
-    within = ~(near | far | void | full)
-    shield_m = np.where(within, true_m, np.float32(np.nan))
-    limited = int(np.count_nonzero(within))
-    if flying_step_m < math.inf:
-        within &= ~flying_pixels(true_m, flying_step_m)
-    whole = int(np.count_nonzero(within))
+    is_flying = flying_pixels(true_m, flying_step_m) if flying_step_m < math.inf else np.zeros(true_m.shape, bool)
     # Silence means empty space only where the rig states it, and not where too much light returned.
     silent_m = min(mounted.known_sensing.no_return_clears_m or 0.0, max_range_m)
-    silent = void & ~full & (silent_m > 0)
-    missing = void & ~full & (silent_m == 0)
+    range_m, shield_m = np.empty(true_m.shape, np.float32), np.empty(true_m.shape, np.float32)
+    silent, missing = np.empty(true_m.shape, bool), np.empty(true_m.shape, bool)
+    whole, no_return, saturated, too_near, too_far, flying = sort_ranges_into(
+        range_m,
+        shield_m,
+        silent,
+        missing,
+        true_m,
+        full_pixels(scan, mounted),
+        is_flying,
+        np.float32(min_range_m),
+        np.float32(max_range_m),
+        silent_m > 0,
+    )
     if rig.body is not None:
         T_body_tof = mounted.transform if scan.T_map_body is None else inverse(scan.T_map_body) @ T_map_tof
-        within &= ~_on_body(rig.body, np.where(within, true_m, np.float32(np.nan)), mounted, T_body_tof)
+        range_m[_on_body(rig.body, range_m, mounted, T_body_tof)] = np.nan
         if silent.any():
             # A beam that the body stops may return nothing.
             beams = mounted.camera.rays() @ T_body_tof[:3, :3].T
             silent &= ~rig.body.stops(T_body_tof[:3, 3], beams, silent_m)
-    range_m = np.where(within, true_m, np.float32(np.nan))
-    pixels, points_map = returned_points(range_m, mounted.camera.rays(), T_map_tof)
+    pixels, points_map, farthest_m = returned_points(range_m, mounted.camera.rays(), T_map_tof)
     counts = ReturnCounts(
         used=len(pixels),
-        no_return=int(np.count_nonzero(void & ~full)),
-        saturated=int(np.count_nonzero(full)),
-        too_near=int(np.count_nonzero(near & ~full)),
-        too_far=int(np.count_nonzero(far & ~full)),
-        flying=limited - whole,
+        no_return=no_return,
+        saturated=saturated,
+        too_near=too_near,
+        too_far=too_far,
+        flying=flying,
         own_body=whole - len(pixels),
     )
-    return Returns(T_map_tof, range_m, shield_m, silent, silent_m, missing, pixels, points_map, counts)
+    reach_m = max(farthest_m if len(pixels) else 0.0, silent_m if silent.any() else 0.0)
+    return Returns(T_map_tof, range_m, shield_m, silent, silent_m, missing, pixels, points_map, counts, reach_m)
 
 
 def full_pixels(scan: Scan, mounted: MountedCamera) -> Flags:
@@ -170,9 +178,11 @@ def margins_m(sigma_m: Floats, *, voxel_edge_m: float, noise_sigmas: float) -> F
 
 def clear_image(returns: Returns, mounted: MountedCamera, *, voxel_edge_m: float, noise_sigmas: float) -> Singles:
     """(H, W) clear range of each pixel of an image without gaps between its pixels, metres; 0 for unknown."""
-    seen_m, shield_m = np.where(returns.silent, np.float32(np.inf), returns.range_m), returns.shield_m
-    if returns.missing.any():
-        shield_m = shield_m.copy()
+    seen_m, shield_m = returns.range_m, returns.shield_m
+    if returns.silent_m > 0:
+        seen_m = np.where(returns.silent, np.float32(np.inf), seen_m)
+    elif returns.missing.any():
+        seen_m, shield_m = seen_m.copy(), shield_m.copy()
         bridge_gaps_into(seen_m, shield_m, returns.missing)
     nearest_m, share = nearest_around(
         seen_m,
@@ -181,6 +191,26 @@ def clear_image(returns: Returns, mounted: MountedCamera, *, voxel_edge_m: float
         float(max(mounted.camera.focal_px)),
         voxel_edge_m,
     )
-    sigma_m = mounted.range_sigma_image(nearest_m)
-    kept_m = share * margins_m(sigma_m, voxel_edge_m=voxel_edge_m, noise_sigmas=noise_sigmas).astype(np.float32)
-    return np.asarray(np.maximum(nearest_m - kept_m, np.float32(0.0)))
+    stay_before_into(nearest_m, share, sigma_image(mounted, nearest_m), MARGIN_VOXELS * voxel_edge_m, noise_sigmas)
+    return nearest_m
+
+
+def sigma_image(mounted: MountedCamera, range_m: Singles) -> Floats:
+    """(H, W) of `MountedCamera.range_sigma_image`."""
+    if mounted.range_bias is not None:
+        return mounted.range_sigma_image(range_m)
+    return interpolated(range_m.ravel(), mounted.range_noise_nodes).reshape(range_m.shape)
+
+
+def sigmas_of_pixels(mounted: MountedCamera, image_m: Singles, pixels: Int32s, range_m: Floats) -> Floats:
+    """(N,) standard deviation of the ranges of some of an image's pixels, metres.
+
+    Args:
+        mounted: the range camera.
+        image_m: (H, W) its image, metres.
+        pixels: (N,) numbers of the pixels.
+        range_m: (N,) their ranges, metres.
+    """
+    if mounted.range_bias is None:
+        return interpolated(range_m, mounted.range_noise_nodes)
+    return np.asarray(mounted.range_sigma_image(image_m).ravel()[pixels])

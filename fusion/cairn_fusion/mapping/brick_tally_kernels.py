@@ -14,25 +14,31 @@ BRICK_VOXELS = 8
 
 
 @nb.njit(cache=True, nogil=True)
-def returned_points(range_m: npt.NDArray[np.float32], rays: Floats, T_map_camera: Floats) -> tuple[Int32s, Floats]:
-    """(N,) numbers of the pixels with a range and a ray, and (N, 3) their points, map frame (Eq. 1-5)."""
+def returned_points(
+    range_m: npt.NDArray[np.float32], rays: Floats, T_map_camera: Floats
+) -> tuple[Int32s, Floats, float]:
+    """Numbers (N,) of pixels with a range and a ray, their points (N, 3), map frame (Eq. 1-5); the longest range."""
     pixels = np.empty(range_m.size, np.int32)
     points = np.empty((range_m.size, 3))
     count = 0
-    flat, beams = range_m.ravel(), rays.reshape(-1, 3)
+    flat, beams, farthest_m = range_m.ravel(), rays.reshape(-1, 3), 0.0
+    r00, r01, r02, t0 = T_map_camera[0, 0], T_map_camera[0, 1], T_map_camera[0, 2], T_map_camera[0, 3]
+    r10, r11, r12, t1 = T_map_camera[1, 0], T_map_camera[1, 1], T_map_camera[1, 2], T_map_camera[1, 3]
+    r20, r21, r22, t2 = T_map_camera[2, 0], T_map_camera[2, 1], T_map_camera[2, 2], T_map_camera[2, 3]
     for i in range(len(flat)):
         r = np.float64(flat[i])
+        farthest_m = r if r > farthest_m else farthest_m
         if np.isnan(r) or np.isnan(beams[i, 0]):
             continue
         # Eq. 1 and 4: the range is measured along the beam, so the point is range times unit ray.
         x, y, z = r * beams[i, 0], r * beams[i, 1], r * beams[i, 2]
         # Eq. 5, with the map in place of the other camera.
-        for a in range(3):
-            T = T_map_camera[a]
-            points[count, a] = T[0] * x + T[1] * y + T[2] * z + T[3]
+        points[count, 0] = r00 * x + r01 * y + r02 * z + t0
+        points[count, 1] = r10 * x + r11 * y + r12 * z + t1
+        points[count, 2] = r20 * x + r21 * y + r22 * z + t2
         pixels[count] = i
         count += 1
-    return pixels[:count].copy(), points[:count].copy()
+    return pixels[:count], points[:count], farthest_m
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
@@ -121,7 +127,7 @@ def forget_hits_into(bricks: Int32s, table_of: Int32s, struck: Int32s, touched: 
 
 @nb.njit(cache=True, nogil=True)
 def claim_rows_into(voxels: Ints, table_of: Int32s, row_of: Int32s, rows: Int32s, used: int) -> int:
-    """Give each voxel that has no row the next one; returns rows used.
+    """Give each voxel that has no row the next one; returns rows used. Rows and sums in one loop take a third longer.
 
     `row_of` (T, 512) is one more than a voxel's row, 0 for none; `rows` (N,) takes the row of each.
     """

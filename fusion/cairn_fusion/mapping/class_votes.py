@@ -111,10 +111,10 @@ class ClassVotes:
                 # Its own image: each point lies in its own pixel.
                 of_point = numbers.ravel()[returns.pixels]
             else:
-                transfer = sight.into(camera, np.zeros(len(voxel_of), np.bool_))
+                transfer = sight.into(camera, np.zeros(len(voxels), np.bool_), voxel_of.astype(np.int32))
                 of_point = np.full(len(voxel_of), SILENT, np.int64)
                 seen = np.nonzero(transfer.labels == Label.OK)[0]
-                x, y = transfer.pixels[seen].T
+                x, y = transfer.pixels[:, seen]
                 of_point[seen] = numbers[y, x]
             said = of_point != SILENT
             if said.any():

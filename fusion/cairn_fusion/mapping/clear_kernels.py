@@ -17,9 +17,10 @@ import math
 
 import numba as nb
 import numpy as np
+import numpy.typing as npt
 
 from cairn_fusion.transfer.transfer_kernels import step_beside
-from cairn_map.arrays import Flags, Singles
+from cairn_map.arrays import Flags, Floats, Int32s, Singles
 
 GAP_PX = 2
 BRIDGE_STEP_M = 1.0
@@ -34,6 +35,100 @@ EDGE_SHARE = 1.0
 GRAZING_SHARE = 0.4
 GRAZING_MAX = 3.0
 """A margin is at least 0.4 of itself across the surface, but never more than 3 times as long along the beam."""
+
+
+@nb.njit(cache=True, nogil=True)
+def sort_ranges_into(
+    range_m: Singles,
+    shield_m: Singles,
+    silent: Flags,
+    missing: Flags,
+    true_m: Singles,
+    full: Flags,
+    flying: Flags,
+    min_range_m: np.float32,
+    max_range_m: np.float32,
+    is_silence_clear: bool,
+) -> tuple[int, int, int, int, int, int]:
+    """Sort an image's pixels by what came back; counts: used, no return, saturated, too near, too far, flying.
+
+    Args:
+        range_m: (H, W) takes the ranges that count, NaN elsewhere.
+        shield_m: the same with flying pixels.
+        silent: takes the pixels without a return where that means empty space.
+        missing: takes those where it does not.
+        true_m: (H, W) measured ranges; NaN where nothing came back.
+        full: (H, W) true where too much light came back.
+        flying: (H, W) true for flying pixels.
+        min_range_m: least range that counts.
+        max_range_m: greatest range that counts.
+        is_silence_clear: true if no return means empty space.
+    """
+    used, void, saturated, near, far, flew = 0, 0, 0, 0, 0, 0
+    nothing = np.float32(np.nan)
+    for y in range(true_m.shape[0]):
+        # Row by row without branches, and so in vector instructions.
+        for x in range(true_m.shape[1]):
+            r, is_full = true_m[y, x], full[y, x]
+            is_void, is_near, is_far = (r != r) & (not is_full), (r < min_range_m) & (not is_full), (r > max_range_m)
+            within = (r >= min_range_m) & (r <= max_range_m) & (not is_full)
+            counts = within & (not flying[y, x])
+            shield_m[y, x] = r if within else nothing
+            range_m[y, x] = r if counts else nothing
+            silent[y, x], missing[y, x] = is_void & is_silence_clear, is_void & (not is_silence_clear)
+            used += int(counts)
+            void += int(is_void)
+            saturated += int(is_full)
+            near += int(is_near)
+            far += int(is_far & (not is_full))
+            flew += int(within & flying[y, x])
+    return used, void, saturated, near, far, flew
+
+
+@nb.njit(cache=True, nogil=True)
+def interpolated(values: npt.NDArray[np.floating], nodes: Floats) -> Floats:
+    """(N,) values between (2, K) nodes, as `np.interp` gives them, and NaN for NaN."""
+    last = nodes.shape[1] - 1
+    out = np.empty(len(values))
+    for n in range(len(values)):
+        out[n] = nodes[1, 0]
+    # Node by node without branches, and so in vector instructions: a search in each of few nodes takes far longer.
+    for k in range(last):
+        first, low = nodes[0, k], nodes[1, k]
+        slope = (nodes[1, k + 1] - low) / (nodes[0, k + 1] - first)
+        for n in range(len(values)):
+            x = np.float64(values[n])
+            out[n] = slope * (x - first) + low if x >= first else out[n]
+    end, high = nodes[0, last], nodes[1, last]
+    for n in range(len(values)):
+        x = np.float64(values[n])
+        out[n] = high if x >= end else out[n]
+        out[n] = out[n] if x == x else x
+    return out
+
+
+@nb.njit(cache=True, nogil=True)
+def stay_before_into(nearest_m: Singles, share: Singles, sigma_m: Floats, least_m: float, noise_sigmas: float) -> None:
+    """Shorten nearest ranges by their margins, 0 at least: `share` times the larger of `least_m` and some sigmas."""
+    nearest, shares, sigmas = nearest_m.ravel(), share.ravel(), sigma_m.ravel()
+    for n in range(len(nearest)):
+        margin_m = noise_sigmas * sigmas[n]
+        margin_m = margin_m if margin_m > least_m else least_m
+        left_m = nearest[n] - shares[n] * np.float32(margin_m)
+        nearest[n] = left_m if left_m > np.float32(0.0) else np.float32(0.0)
+
+
+@nb.njit(cache=True, nogil=True)
+def shown_in_window(clear_m: Singles, pixel_of: Int32s, height: int, width: int) -> Singles:
+    """(height + 2, width + 2) clear range of each pixel of a window (`free_space.Window.shown`); 0 around it."""
+    padded, flat = np.zeros((height + 2, width + 2), np.float32), clear_m.ravel()
+    for y in range(height):
+        row, pixels = padded[y + 1, 1:], pixel_of[y * width :]
+        for x in range(width):
+            # One past the last pixel: outside the camera's image, and never clear.
+            pixel = pixels[x]
+            row[x] = flat[pixel] if pixel < len(flat) else np.float32(0.0)
+    return padded
 
 
 @nb.njit(cache=True, nogil=True)

@@ -56,6 +56,18 @@ def window_extremes_into(extremes: Singles, clear: Singles) -> None:
                 out[i] = pairs[i] if pairs[i] < shifted[i] else shifted[i]
 
 
+@nb.njit(cache=True, nogil=True)
+def offsets_in_view(places: Floats, R: Floats, edge_m: float) -> Singles:
+    """(3, N) from the first voxel's centre of a brick to that of each place (3, N) x, y, z in voxels, camera frame."""
+    # The rotation into the camera's frame: R's columns are the camera's axes.
+    offsets = np.empty(places.shape, np.float32)
+    for a in range(3):
+        for n in range(places.shape[1]):
+            x, y, z = places[0, n] * edge_m, places[1, n] * edge_m, places[2, n] * edge_m
+            offsets[a, n] = np.float32(x * R[0, a] + y * R[1, a] + z * R[2, a])
+    return offsets
+
+
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def cull_bricks_into(
     found: Int32s,

@@ -4,6 +4,7 @@ For any lens, the image is first resampled to a pinhole window of the same resol
 centre finds its pixel by one division. Hits are not decided here: they are the ends of the beams.
 """
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -11,10 +12,12 @@ import numpy as np
 
 from cairn_calib.rig.lidar import AnyCamera
 from cairn_calib.rig.poses import Transform
+from cairn_fusion.mapping.clear_kernels import shown_in_window
 from cairn_fusion.mapping.cull_kernels import (
     BRICK_VOXELS,
     LEVELS_MAX,
     cull_bricks_into,
+    offsets_in_view,
     split_bricks_into,
     window_extremes_into,
 )
@@ -37,11 +40,8 @@ class Window:
 
     def shown(self, clear_m: Singles) -> Singles:
         """(height + 2, width + 2) clear range of each pixel of the window, from (H, W) of the camera; 0 around it."""
-        # The last entry is that of pixels outside the camera's image: never clear.
-        padded = np.zeros((self.height + 2, self.width + 2), np.float32)
-        found = np.append(clear_m.ravel(), np.float32(0.0))[self.pixel_of]
-        padded[1:-1, 1:-1] = found.reshape(self.height, self.width)
-        return padded
+        # The number past the last is that of pixels outside the camera's image: never clear.
+        return shown_in_window(clear_m, self.pixel_of, self.height, self.width)
 
 
 @lru_cache(maxsize=32)
@@ -143,8 +143,12 @@ def carving_of(
     corner_m: Floats = corner.astype(np.float64) * voxel_edge_m
     # Stage 1: the bricks around the eye that the longest beam reaches, a tenth of a brick more for rounding.
     reach_m = float(clear_m.max())
-    around = (t - corner_m + np.array([[-reach_m], [reach_m]])) / (BRICK_VOXELS * voxel_edge_m)
-    low, high = np.clip(np.floor(around + np.array([[-0.1], [0.1]])).astype(np.int64), [[0], [-1]], dims - 1)
+    # Plain numbers: arrays of three take NumPy ten times as long.
+    brick_m, from_corner_m, last = BRICK_VOXELS * voxel_edge_m, (t - corner_m).tolist(), (dims - 1).tolist()
+    firsts = [math.floor((x - reach_m) / brick_m - 0.1) for x in from_corner_m]
+    lasts = [math.floor((x + reach_m) / brick_m + 0.1) for x in from_corner_m]
+    low = np.array([min(max(n, 0), end) for n, end in zip(firsts, last, strict=True)])
+    high = np.array([min(max(n, -1), end) for n, end in zip(lasts, last, strict=True)])
     # Stage 2: cubes of bricks; again with more room if there are more bricks than rows.
     view = (corner_m - t, voxel_edge_m, R, window.lens, min_range_m, reach_m, scratch.extremes(clear_m))
     count = cull_bricks_into(scratch.found(0), low, high, dims, *view)
@@ -159,16 +163,9 @@ def carving_of(
         squares=np.square(clear_m),
         lens=window.lens.astype(np.float32),
         corners_view=corners_view,
-        offsets_view=_offsets_in_view(R, voxel_edge_m),
+        offsets_view=offsets_in_view(MORTON_XYZ, R, voxel_edge_m),
         min_square=min_range_m**2,
     )
-
-
-def _offsets_in_view(R: Floats, voxel_edge_m: float) -> Singles:
-    """(3, 512) from the first voxel's centre of a brick to each voxel's, camera frame."""
-    # The rotation into the camera's frame: R's columns are the camera's axes.
-    x, y, z = MORTON_XYZ * voxel_edge_m
-    return np.stack([x * R[0, a] + y * R[1, a] + z * R[2, a] for a in range(3)]).astype(np.float32)
 
 
 def _morton_xyz() -> Floats:

@@ -33,10 +33,10 @@ from cairn_fusion.mapping.class_votes import ClassVotes, classes_of_labels
 from cairn_fusion.mapping.free_space import Window, carving_of, window_of
 from cairn_fusion.mapping.level.votes import votes_of
 from cairn_fusion.mapping.ray_casting import beam_evidence, carried, clear_ends, silent_ends
-from cairn_fusion.mapping.samples import ImageTransfers, SampleLimits, sample_sums
+from cairn_fusion.mapping.samples import ImageTransfers, SampleLimits, Sampling
 from cairn_fusion.recording.scan import Scan, check_scan
 from cairn_fusion.transfer.transfer import DEPTH_TOLERANCE_M
-from cairn_map.arrays import Floats, Ints
+from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.brick_cell import sum_evidence
 from cairn_map.evidence.channels import ChannelKind
@@ -137,6 +137,10 @@ class Integration:
         reach_m = TIME_OF_FLIGHT_REACH_M if integrator.max_range_m is None else integrator.max_range_m
         self._tallies = TallyPool(geometry, max_range_m=reach_m, around_m=around_m)
         self._votes = ClassVotes(geometry)
+        # A sample whose place is less certain than this could be another voxel's.
+        spread_m = integrator.sample_spread_voxels * geometry.voxel_edge_m
+        limits = SampleLimits(spread_m, integrator.temperature_step_k, integrator.hidden_behind_m)
+        self._sampling = Sampling(rig, geometry, limits)
         self._lock = Lock()
         self.counts = ReturnCounts()
         """Count of the pixels of all scans, by what became of them."""
@@ -165,15 +169,16 @@ class Integration:
         # Stage 2: named readings and labels, checked before anything is counted.
         scalars, classes = _scalar_evidence(scan, self._geometry), classes_of_labels(scan, self._geometry)
         # Stage 3: hits, samples and misses.
+        sight = ImageTransfers(scan, returns, self._sampling)
         if self._geometry.is_flat:
             self._tallies.merge(votes_of(returns.T_map_tof[:3, 3], returns.points_map, self._geometry))
         elif window is None:
-            self._cast(scan, returns)
+            self._cast(scan, returns, sight)
         elif returns.reach_m > 0:
-            self._carve(scan, returns, window)
+            self._carve(scan, returns, window, sight)
         self._tallies.merge(scalars)
         # Stage 4: one vote for a class wherever a labelled pixel shows a voxel that was hit.
-        self._votes.add(classes, scan, rig, returns, ImageTransfers(scan, rig, returns, self._sample_limits))
+        self._votes.add(classes, scan, rig, returns, sight)
         with self._lock:
             self.counts += returns.counts
 
@@ -251,7 +256,7 @@ class Integration:
         self.add_points(points, T_map_sensor, range_camera=scan.range_camera, T_map_body=body)
         self._tallies.merge(scalars)
 
-    def _carve(self, scan: Scan, returns: Returns, window: Window) -> None:
+    def _carve(self, scan: Scan, returns: Returns, window: Window, sight: ImageTransfers) -> None:
         """Count hits where beams ended, misses where the image looks through."""
         edge_m = self._geometry.voxel_edge_m
         mounted, sigmas = self._rig[scan.range_camera], self._integrator.noise_sigmas
@@ -261,7 +266,7 @@ class Integration:
         with self._tallies.around(returns.T_map_tof[:3, 3], returns.reach_m) as (tally, hits):
             # Each voxel that was hit has one number within this scan, however many beams ended in it.
             voxel_of, count = hits.number(returns.points_map, tally)
-            sums = self._sample_sums(scan, returns, voxel_of, count)
+            sums = sight.sums(voxel_of, count)
             # Voxels that the image looks through: culled by bricks, then voxel by voxel.
             carving = carving_of(
                 window.shown(clear_m),
@@ -277,7 +282,7 @@ class Integration:
             tally.add_hits(hits, sums)
             tally.add_misses(hits, carving)
 
-    def _cast(self, scan: Scan, returns: Returns) -> None:
+    def _cast(self, scan: Scan, returns: Returns, sight: ImageTransfers) -> None:
         """Count hits where beams ended, misses along each beam."""
         mounted, origin_m = self._rig[scan.range_camera], returns.T_map_tof[:3, 3]
         # Beams that returned end a margin before their point; beams without a return are clear as far as the sensor
@@ -286,31 +291,7 @@ class Integration:
         clear_m = np.concatenate(
             [self._clear_ends(origin_m, returns.points_map, sigma_m), silent_ends(returns, mounted.camera.rays())]
         )
-
-        def sums_of(voxel_of: Ints, count: int) -> Ints:
-            return self._sample_sums(scan, returns, voxel_of, count)
-
-        self._tallies.merge(beam_evidence(origin_m, returns.points_map, clear_m, self._geometry, sums_of=sums_of))
-
-    def _sample_sums(self, scan: Scan, returns: Returns, voxel_of: npt.NDArray[np.integer], count: int) -> Ints:
-        limits = self._sample_limits
-        return sample_sums(
-            scan,
-            self._rig,
-            self._geometry,
-            returns,
-            voxel_of,
-            count,
-            spread_max_m=limits.spread_max_m,
-            step_max_k=limits.step_max_k,
-            hidden_behind_m=limits.hidden_behind_m,
-        )
-
-    @property
-    def _sample_limits(self) -> SampleLimits:
-        # A sample whose place is less certain than this could be another voxel's.
-        limit_m = self._integrator.sample_spread_voxels * self._geometry.voxel_edge_m
-        return SampleLimits(limit_m, self._integrator.temperature_step_k, self._integrator.hidden_behind_m)
+        self._tallies.merge(beam_evidence(origin_m, returns.points_map, clear_m, self._geometry, sums_of=sight.sums))
 
     def _clear_ends(self, origin_m: Floats, points_map: Floats, sigma_m: Floats) -> Floats:
         edge_m, sigmas = self._geometry.voxel_edge_m, self._integrator.noise_sigmas

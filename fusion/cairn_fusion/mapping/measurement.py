@@ -1,11 +1,12 @@
 """Measurement: the sum of the scans of one stop, and the facts about them that a commit states."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 
-from cairn_calib.rig.poses import Transform, quaternion_from_transform
+from cairn_calib.rig.poses import Transform, quaternions_from_transforms
 from cairn_calib.rig.rig import Rig
 from cairn_fusion.mapping.beam_returns import ReturnCounts
 from cairn_fusion.mapping.integrate import Integration, Integrator
@@ -26,14 +27,24 @@ class Measurement:
     rig: Rig
     geometry: Geometry
     integrator: Integrator = field(default_factory=Integrator)
-    poses: list[ScanPose] = field(default_factory=list)
     _integration: Integration = field(init=False)
+    _poses: list[ScanPose] = field(default_factory=list)
+    _newest: list[tuple[float, Transform]] = field(default_factory=list)
+    """Times and poses of the scans that are not in `_poses` yet."""
 
     def __post_init__(self) -> None:
         self._integration = Integration(self.rig, self.geometry, self.integrator)
 
     def __len__(self) -> int:
-        return len(self.poses)
+        return len(self._poses) + len(self._newest)
+
+    @property
+    def poses(self) -> list[ScanPose]:
+        """Poses of the rig for the scans added so far, as a commit states them."""
+        # Many at once: one by one they take a tenth of what integrating a small scan does.
+        self._poses += scan_poses(self._newest)
+        self._newest = []
+        return self._poses
 
     def add(self, scan: Scan) -> None:
         """Add a scan.
@@ -72,7 +83,7 @@ class Measurement:
             raise BadInputError("measurement_full", f"a measurement has at most {SCANS_MAX} scans; commit it first")
 
     def _note_pose(self, time_s: float, T_map_rig: Transform) -> None:
-        self.poses.append(scan_pose(time_s, T_map_rig))
+        self._newest.append((time_s, T_map_rig))
 
     def diff(self) -> dict[CellKey, Evidence]:
         """The evidence of all scans, by cell."""
@@ -92,6 +103,16 @@ class Measurement:
 
 def scan_pose(time_s: float, T_map_rig: Transform) -> ScanPose:
     """Pose of the rig for one scan, as a commit states it."""
-    x, y, z = (float(v) for v in T_map_rig[:3, 3])
-    q = [float(v) for v in quaternion_from_transform(T_map_rig)]
-    return ScanPose(time_s=time_s, t_map_rig=(x, y, z), q_map_rig=(q[0], q[1], q[2], q[3]))
+    return scan_poses([(time_s, T_map_rig)])[0]
+
+
+def scan_poses(scans: Sequence[tuple[float, Transform]]) -> list[ScanPose]:
+    """Poses of the rig for scans of these times, as a commit states them."""
+    if not scans:
+        return []
+    T_map_rig = np.array([T for _, T in scans])
+    stated = zip(T_map_rig[:, :3, 3].tolist(), quaternions_from_transforms(T_map_rig).tolist(), strict=True)
+    return [
+        ScanPose(time_s=time_s, t_map_rig=(t[0], t[1], t[2]), q_map_rig=(q[0], q[1], q[2], q[3]))
+        for (time_s, _), (t, q) in zip(scans, stated, strict=True)
+    ]

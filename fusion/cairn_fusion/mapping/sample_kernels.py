@@ -4,80 +4,129 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
-from cairn_fusion.transfer.transfer_kernels import OK, UNCERTAIN
-from cairn_map.arrays import Floats, Int32s, Ints
+from cairn_fusion.transfer.transfer_kernels import OK, REACH_MAX_PX, UNCERTAIN
+from cairn_map.arrays import Flags, Floats, Int32s, Ints, Labels, Singles
 from cairn_map.evidence.channels import SAMPLE_MAX
 
 
-@nb.njit(cache=True, nogil=True)
+@nb.njit(cache=True, nogil=True, error_model="numpy")
 def doubt_edges_into(
-    labels: npt.NDArray[np.uint8],
-    pixels: Ints,
-    reach_px: Int32s,
-    image: npt.NDArray[np.float32],
+    labels: Labels,
+    pixels: Int32s,
+    range_m: Floats,
+    sigma_m: Floats,
+    fixed_px: float,
+    moved_px: float,
+    image: Singles,
     step_max: float,
 ) -> None:
     """Label points UNCERTAIN if the image around their pixel differs by more than a step.
 
     Args:
         labels: (N,) only points labelled OK are examined.
-        pixels: (N, 2) x, y, where the label is OK.
-        reach_px: (N,) pixels to each side within which the point may be.
+        pixels: (2, N) x and y, where the label is OK.
+        range_m: (N,)
+        sigma_m: (N,) standard deviation of the ranges.
+        fixed_px: reach of `pixel_covariance.PlaceBounds`, to each side, within which the point may be.
+        moved_px: its part by the range's noise.
         image: (H, W); pixels that are no number do not count.
         step_max: largest difference between the least and the greatest value.
     """
     height, width = image.shape
+    examined = 0
+    for n in range(labels.shape[0]):
+        examined += int(labels[n] == OK)
+    # The reach of most points is the same: for this one all pixels of the image are examined at once, if that is less.
+    usual = _whole_reach(fixed_px)
+    is_tabled = examined * (2 * usual + 1) ** 2 > height * width
+    uneven = _uneven(image, usual, step_max) if is_tabled else np.empty((0, 0), np.bool_)
     for n in range(labels.shape[0]):
         if labels[n] != OK:
             continue
-        # Least and greatest value of the square of pixels, cut at the image's border.
-        x, y, reach = pixels[n, 0], pixels[n, 1], np.int64(reach_px[n])
-        least, most = np.float32(np.inf), np.float32(-np.inf)
-        for j in range(max(y - reach, 0), min(y + reach + 1, height)):
-            for i in range(max(x - reach, 0), min(x + reach + 1, width)):
-                # Written so that NaN changes neither.
-                value = image[j, i]
-                least = value if value < least else least
-                most = value if value > most else most
-        if most - least > step_max:
+        x, y = int(pixels[0, n]), int(pixels[1, n])
+        reach = _whole_reach(fixed_px + moved_px * sigma_m[n] / (range_m[n] * range_m[n]))
+        if is_tabled and reach == usual:
+            is_edge = uneven[y, x]
+        else:
+            # Least and greatest value of the square of pixels, cut at the image's border.
+            least, most = np.float32(np.inf), np.float32(-np.inf)
+            for j in range(max(y - reach, 0), min(y + reach + 1, height)):
+                for i in range(max(x - reach, 0), min(x + reach + 1, width)):
+                    # Written so that NaN changes neither.
+                    value = image[j, i]
+                    least = value if value < least else least
+                    most = value if value > most else most
+            is_edge = most - least > step_max
+        if is_edge:
             labels[n] = UNCERTAIN
+
+
+@nb.njit(forceinline=True)
+def _whole_reach(reach_px: float) -> int:
+    """Whole pixels of a reach, 1 to `REACH_MAX_PX`."""
+    return int(min(max(np.floor(reach_px), 1.0), np.float64(REACH_MAX_PX)))
+
+
+@nb.njit(cache=True, nogil=True)
+def _uneven(image: Singles, reach: int, step_max: float) -> Flags:
+    """(H, W) true where the square of pixels that reaches so far to each side differs by more than a step."""
+    height, width = image.shape
+    uneven = np.empty((height, width), np.bool_)
+    # With a border that changes nothing. Columns first: the least and the greatest of each, and then those of the row.
+    least, most = np.empty(width + 2 * reach, np.float32), np.empty(width + 2 * reach, np.float32)
+    low, high = np.empty(width, np.float32), np.empty(width, np.float32)
+    for y in range(height):
+        least[:], most[:] = np.inf, -np.inf
+        for j in range(max(y - reach, 0), min(y + reach + 1, height)):
+            row, down, up = image[j], least[reach:][:width], most[reach:][:width]
+            for x in range(width):
+                # Written so that NaN changes neither.
+                down[x] = row[x] if row[x] < down[x] else down[x]
+                up[x] = row[x] if row[x] > up[x] else up[x]
+        low[:], high[:] = least[:width], most[:width]
+        for i in range(1, 2 * reach + 1):
+            down, up = least[i:][:width], most[i:][:width]
+            for x in range(width):
+                low[x] = down[x] if down[x] < low[x] else low[x]
+                high[x] = up[x] if up[x] > high[x] else high[x]
+        out = uneven[y]
+        for x in range(width):
+            out[x] = high[x] - low[x] > step_max
+    return uneven
 
 
 @nb.njit(cache=True, nogil=True)
 def add_pixels_into(
     totals: Floats,
     counts: Ints,
-    taken: npt.NDArray[np.bool_],
     image: npt.NDArray[np.generic],
-    pixels: Ints,
-    labels: npt.NDArray[np.uint8],
+    pixels: Int32s,
+    labels: Labels,
     voxel_of: Int32s,
 ) -> None:
-    """Add each point's pixel to its voxel, except for points already taken; take those that had a value.
+    """Add the pixel of each point that is labelled OK to its voxel.
 
     Args:
         totals: (U, C) sums of values by voxel.
         counts: (U,) pixels by voxel.
-        taken: (N,) points that have a value from another image.
         image: (H, W, C); a number that is not finite is no value.
-        pixels: (N, 2) x, y, where the label is OK.
+        pixels: (2, N) x and y, where the label is OK.
         labels: (N,)
         voxel_of: (N,)
     """
     for n in range(labels.shape[0]):
-        if taken[n] or labels[n] != OK:
+        if labels[n] != OK:
             continue
-        x, y = pixels[n, 0], pixels[n, 1]
+        x, y, voxel = np.uint64(pixels[0, n]), np.uint64(pixels[1, n]), np.uint64(voxel_of[n])
         # A pixel counts with all its channels, or not at all.
         valid = True
         for c in range(image.shape[2]):
             valid &= bool(np.isfinite(image[y, x, c]))
         if not valid:
             continue
-        taken[n] = True
-        counts[voxel_of[n]] += 1
+        counts[voxel] += 1
         for c in range(image.shape[2]):
-            totals[voxel_of[n], c] += np.float64(image[y, x, c])
+            totals[voxel, c] += np.float64(image[y, x, c])
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")

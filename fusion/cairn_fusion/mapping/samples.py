@@ -16,55 +16,30 @@ import numpy as np
 import numpy.typing as npt
 
 from cairn_calib.rig.rig import Rig
-from cairn_fusion.mapping.beam_returns import Returns
+from cairn_fusion.mapping.beam_returns import Returns, sigmas_of_pixels
 from cairn_fusion.mapping.sample_kernels import add_pixels_into, doubt_edges_into, write_means_into
 from cairn_fusion.recording.scan import Scan
-from cairn_fusion.transfer.pixel_covariance import is_certain, reach_px_of, spread_m
-from cairn_fusion.transfer.transfer import (
-    DEPTH_TOLERANCE_M,
-    Label,
-    Transfer,
-    transfer_points,
-)
-from cairn_fusion.transfer.transfer_kernels import steps_of
-from cairn_map.arrays import Flags, Floats, Ints, Labels
+from cairn_fusion.transfer.pixel_covariance import PlaceBounds, spread_m
+from cairn_fusion.transfer.transfer import CameraPair, Label, Transfer, transfer_points
+from cairn_fusion.transfer.transfer_kernels import examine_into, points_of_pixels
+from cairn_map.arrays import Flags, Floats, Int32s, Ints
 from cairn_map.evidence.channels import Channel, ChannelKind
 from cairn_map.evidence.grid import Geometry
 
 Numbers = npt.NDArray[np.integer]
 
 
-def sample_sums(
-    scan: Scan,
-    rig: Rig,
-    geometry: Geometry,
-    returns: Returns,
-    voxel_of: Numbers,
-    count: int,
-    *,
-    spread_max_m: float = math.inf,
-    step_max_k: float = math.inf,
-    hidden_behind_m: float = DEPTH_TOLERANCE_M,
-) -> Ints:
-    """(count, P) sums of the scan's voxels: one sample of weight 1 for each channel that a camera saw there.
+@dataclass(frozen=True, slots=True)
+class SampleLimits:
+    """Limits within which a sample counts."""
 
-    Colours and temperatures whose place is uncertain by more than `spread_max_m` are left out (`pixel_covariance`); so
-    are temperatures where the thermal image differs by more than `step_max_k` within the area of a range pixel: at the
-    edge of a hot thing it is unknown which side the range belongs to. `hidden_behind_m` is that of `transfer_points`.
-    """
-    sums = np.zeros((count, geometry.plane_count), np.int64)
-    limits = SampleLimits(spread_max_m, step_max_k, hidden_behind_m)
-    sight, numbers = ImageTransfers(scan, rig, returns, limits), voxel_of.astype(np.int32, copy=False)
-    for channel in geometry.channels:
-        taken, weight = np.zeros(len(returns.pixels), np.bool_), geometry.planes_of(channel.name).stop - 1
-        # The first camera counts wherever it sees; the next ones fill only voxels hidden from those before.
-        for image, pixels, labels in sight.images_of(channel.kind, taken):
-            totals, counts = np.zeros((count, channel.value_count)), np.zeros(count, np.int64)
-            add_pixels_into(totals, counts, taken, np.atleast_3d(image), pixels, labels, numbers)
-            _write_means_into(sums, geometry, channel, totals, counts)
-            # No further image adds to a voxel with a sample: most points need no look into the second one.
-            taken |= (sums[:, weight] != 0)[numbers]
-    return sums
+    spread_max_m: float
+    """Largest uncertainty of a sample's place, metres (`pixel_covariance`)."""
+    step_max_k: float
+    """Largest difference of the thermal image within the area of a range pixel, kelvin: at the edge of a hot thing it
+    is unknown which side the range belongs to. Infinite: no limit."""
+    hidden_behind_m: float
+    """That of `transfer_points`."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,7 +47,7 @@ class _Points:
     """Points of the range camera, and their noise."""
 
     tof: Floats
-    """(N, 3) metres, frame of the range camera."""
+    """(3, N) metres, frame of the range camera."""
     range_m: Floats
     """(N,) metres along the beam."""
     steps_m: Floats
@@ -81,91 +56,109 @@ class _Points:
     """(N,) standard deviation of the ranges."""
 
 
-@dataclass(frozen=True, slots=True)
-class SampleLimits:
-    """Limits within which a sample counts; arguments of `sample_sums`."""
+class Sampling:
+    """Samples of one rig's scans for a map, within limits; any thread may use it."""
 
-    spread_max_m: float
-    step_max_k: float
-    hidden_behind_m: float
+    def __init__(self, rig: Rig, geometry: Geometry, limits: SampleLimits) -> None:
+        self.rig = rig
+        self.geometry = geometry
+        self.limits = limits
+        self._pairs: dict[tuple[str, str], tuple[CameraPair, PlaceBounds]] = {}
+
+    def pair(self, *, src: str, dst: str) -> tuple[CameraPair, PlaceBounds]:
+        """A pair of cameras, and bounds for the samples of `dst`; computed once."""
+        # Two threads at once compute equal ones.
+        if (src, dst) not in self._pairs:
+            bounds = PlaceBounds.of(self.rig, src=src, dst=dst)
+            self._pairs[src, dst] = CameraPair.of(self.rig, src=src, dst=dst), bounds
+        return self._pairs[src, dst]
 
 
 class ImageTransfers:
     """Transfers of a scan's points into its images, each computed when it is needed."""
 
-    def __init__(self, scan: Scan, rig: Rig, returns: Returns, limits: SampleLimits) -> None:
+    def __init__(self, scan: Scan, returns: Returns, sampling: Sampling) -> None:
         self._scan = scan
-        self._rig = rig
+        self._rig = sampling.rig
         self._returns = returns
-        self._limits = limits
+        self._sampling = sampling
         self._points: _Points | None = None
 
-    def images_of(self, kind: ChannelKind, taken: Flags) -> Iterator[tuple[npt.NDArray[np.generic], Ints, Labels]]:
-        """Images of a kind, each with the pixels (N, 2) and labels (N,) of the points.
+    def sums(self, voxel_of: Numbers, count: int) -> Ints:
+        """(count, P) sums of the scan's voxels: one sample of weight 1 for each channel that a camera saw there.
 
         Args:
-            kind: of the images.
-            taken: (N,) points that need no sample any more, as they are when an image comes: none of them is OK there.
+            voxel_of: (N,) number of each point's voxel.
+            count: of voxels.
         """
+        geometry = self._sampling.geometry
+        sums, numbers = np.zeros((count, geometry.plane_count), np.int64), voxel_of.astype(np.int32, copy=False)
+        for channel in geometry.channels:
+            # The first camera counts wherever it sees; the next ones fill only voxels hidden from those before.
+            spoken = np.zeros(count, np.bool_)
+            for image, transfer in self._images_of(channel.kind, spoken, numbers):
+                totals, counts = np.zeros((count, channel.value_count)), np.zeros(count, np.int64)
+                values = image.reshape(*image.shape[:2], -1)
+                add_pixels_into(totals, counts, values, transfer.pixels, transfer.labels, numbers)
+                _write_means_into(sums, geometry, channel, totals, counts)
+                # No further image adds to a voxel with a sample: most points need no look into the second one.
+                spoken |= counts != 0
+        return sums
+
+    def _images_of(
+        self, kind: ChannelKind, spoken: Flags, voxel_of: Int32s
+    ) -> Iterator[tuple[npt.NDArray[np.generic], Transfer]]:
+        """Images of a kind, each with the transfer of the points; arguments as for `into`."""
         scan = self._scan
         if kind is ChannelKind.INTENSITY and scan.amplitude is not None:
             # The range camera's own image: each point lies in its own pixel, and nothing there hides another.
-            # `take`: indexing by rows takes ten times as long.
-            pixels = np.take(_pixels_of(*scan.amplitude.shape), self._returns.pixels, axis=0)
-            yield scan.amplitude, pixels, np.full(len(pixels), Label.OK, np.uint8)
+            pixels = np.take(_pixels_of(*scan.amplitude.shape), self._returns.pixels, axis=1)
+            yield scan.amplitude, Transfer(pixels, np.full(pixels.shape[1], Label.OK, np.uint8))
         images: dict[str, npt.NDArray[np.generic]] = {}
         if kind is ChannelKind.COLOUR:
             images = dict(scan.colour)
         elif kind is ChannelKind.TEMPERATURE:
             images = dict(scan.thermal)
         for name, image in images.items():
-            if taken.all():
+            if spoken.all():
                 return
-            transfer = self.into(name, taken)
-            yield image, transfer.pixels, transfer.labels
+            yield image, self.into(name, spoken, voxel_of)
 
-    def into(self, name: str, taken: Flags) -> Transfer:
-        """Transfer of all points into a camera's image; points with too uncertain a place there are so labelled."""
-        src, limits = self._scan.range_camera, self._limits
-        points = self._seen_points()
+    def into(self, name: str, spoken: Flags, voxel_of: Int32s) -> Transfer:
+        """Transfer of all points into a camera's image; points with too uncertain a place there are so labelled.
+
+        Args:
+            name: of the camera.
+            spoken: (U,) voxels that need no sample any more: none of their points is OK.
+            voxel_of: (N,) number of each point's voxel.
+        """
+        src, limits = self._scan.range_camera, self._sampling.limits
+        points, (pair, bounds) = self._seen_points(), self._sampling.pair(src=src, dst=name)
         # Stage 1: Eq. 5-6 and the z-buffer.
-        transfer = transfer_points(
-            points.tof,
-            self._rig,
-            src=src,
-            dst=name,
-            steps_m=points.steps_m,
-            hidden_behind_m=limits.hidden_behind_m,
-        )
-        # Those that need no sample hide others, and are examined no further.
-        transfer.labels[taken & transfer.ok] = Label.NO_READING
-        # Stage 2: the covariance of the place, only for points that a bound does not clear.
-        certain = is_certain(points.range_m, points.sigma_m, self._rig, src=src, dst=name, limit_m=limits.spread_max_m)
-        doubtful = np.nonzero(transfer.ok & ~certain)[0]
-        if len(doubtful):
-            spread = spread_m(points.tof[doubtful], points.sigma_m[doubtful], self._rig, src=src, dst=name)
+        transfer = transfer_points(points.tof, pair, steps_m=points.steps_m, hidden_behind_m=limits.hidden_behind_m)
+        # Stage 2: the covariance of the place, only for points that a bound does not clear. Those that need no sample
+        # hide others, and are examined no further.
+        labels, doubtful = transfer.labels, np.empty(len(transfer.labels), np.int32)
+        of_points = (points.range_m, points.sigma_m)
+        spread = (bounds.baseline_m, bounds.calibration, limits.spread_max_m)
+        count = examine_into(labels, doubtful, voxel_of, spoken, *of_points, *spread)
+        if count:
+            found = doubtful[:count]
+            spread_of = spread_m(points.tof[:, found].T, points.sigma_m[found], self._rig, src=src, dst=name)
             # Written so that a spread of NaN is uncertain.
-            transfer.labels[doubtful[~(spread <= limits.spread_max_m)]] = Label.UNCERTAIN
+            labels[found[~(spread_of <= limits.spread_max_m)]] = Label.UNCERTAIN
         # Stage 3: edges in the thermal image, within the area that the range pixel covers there.
         if name in self._scan.thermal and limits.step_max_k < math.inf:
-            reach_px = reach_px_of(points.range_m, points.sigma_m, self._rig, src=src, dst=name)
-            image = np.ascontiguousarray(self._scan.thermal[name])
-            doubt_edges_into(transfer.labels, transfer.pixels, reach_px, image, limits.step_max_k)
+            image, reach = np.ascontiguousarray(self._scan.thermal[name]), (bounds.fixed_px, bounds.moved_px)
+            doubt_edges_into(labels, transfer.pixels, *of_points, *reach, image, limits.step_max_k)
         return transfer
 
     def _seen_points(self) -> _Points:
         if self._points is None:
-            mounted, returned = self._rig[self._scan.range_camera], self._returns.pixels
-            image_m, rays = self._returns.range_m.astype(np.float64), mounted.camera.rays()
-            range_m = image_m.ravel()[returned]
-            # Eq. 1-4: of the points that count, and of the whole image only the depth, because a slant takes the pixels
-            # around.
-            self._points = _Points(
-                tof=np.take(rays.reshape(-1, 3), returned, axis=0) * range_m[:, None],
-                range_m=range_m,
-                steps_m=steps_of(rays[..., 2] * image_m).ravel()[returned],
-                sigma_m=mounted.range_sigma_image(self._returns.range_m).ravel()[returned],
-            )
+            mounted, returned, image_m = self._rig[self._scan.range_camera], self._returns.pixels, self._returns.range_m
+            tof, range_m, steps_m = points_of_pixels(image_m, mounted.camera.rays(), returned)
+            sigma_m = sigmas_of_pixels(mounted, image_m, returned, range_m)
+            self._points = _Points(tof, range_m, steps_m, sigma_m)
         return self._points
 
 
@@ -181,7 +174,7 @@ def _write_means_into(sums: Ints, geometry: Geometry, channel: Channel, totals: 
 
 
 @lru_cache(maxsize=32)
-def _pixels_of(height: int, width: int) -> Ints:
-    """(height width, 2) x, y of an image's pixels, row by row."""
-    y, x = np.divmod(np.arange(height * width), width)
-    return np.stack([x, y], axis=1)
+def _pixels_of(height: int, width: int) -> Int32s:
+    """(2, height width) x and y of an image's pixels, row by row."""
+    y, x = np.divmod(np.arange(height * width, dtype=np.int32), np.int32(width))
+    return np.stack([x, y])

@@ -11,23 +11,22 @@ standard deviation of the source pixel itself, where an algorithm found it, and 
 surface that a pixel is taken from is uncertain by as many metres as the longer axis of S spans at the point's depth.
 """
 
+from dataclasses import dataclass
+from typing import Self
+
 import numpy as np
-import numpy.typing as npt
 
 from cairn_calib.rig.fisheye import FisheyeCamera
 from cairn_calib.rig.poses import inverse, transform_points
 from cairn_calib.rig.rig import Rig
 from cairn_fusion.transfer.calibration_covariance import calibration_covariance, lens_of, pixel_gradients
 from cairn_fusion.transfer.covariance_grid import calibration_bound_px
-from cairn_map.arrays import Flags, Floats
+from cairn_fusion.transfer.transfer_kernels import REACH_MAX_PX
+from cairn_map.arrays import Floats
 
-REACH_MAX_PX = 16
-"""Largest reach of `reach_px_of`: a bound on work."""
 CALIBRATION_SIGMAS = 1.5
-"""Standard deviations of calibration in `reach_px_of`. With one, on a rig calibrated to 2 px, 11 % of the mapped
+"""Standard deviations of calibration in a reach. With one, on a rig calibrated to 2 px, 11 % of the mapped
 temperatures of hot things are wrong by over 2 K, against 5 % (docs/decisions/002)."""
-STRETCH_MAX = 8.0
-"""Largest factor by which a lens stretches its image, for `is_certain`."""
 
 
 def pixel_covariance(
@@ -75,29 +74,35 @@ def spread_m(points_src: Floats, sigma_m: Floats, rig: Rig, *, src: str, dst: st
     return np.asarray(spread_px(covariance) * away_m / min(rig[dst].camera.focal_px))
 
 
-def is_certain(range_m: Floats, sigma_m: Floats, rig: Rig, *, src: str, dst: str, limit_m: float) -> Flags:
-    """(N,) true for points whose samples are certainly within a limit of uncertainty, by a bound on their covariance.
+@dataclass(frozen=True, slots=True)
+class PlaceBounds:
+    """Bounds on the uncertainty of a camera's samples that take a few operations a point (`sample_kernels`).
 
-    J moves a pixel by at most some f / z a metre, more only off the axis and where a lens stretches: here, eight times
-    as much is allowed for. With a baseline of 0.1 m and 5 mm at 1 m that is 4 mm.
+    spread  J moves a pixel by at most some f / z a metre, more only off the axis and where a lens stretches: here,
+            eight times as much is allowed for. With a baseline of 0.1 m and 5 mm at 1 m that is 4 mm.
+    reach   whole pixels of `dst`, to each side, that a pixel of the range camera may cover there: half a range pixel,
+            `CALIBRATION_SIGMAS` of calibration, and one of the range's noise, which moves it along the baseline's
+            image by f t sigma / d^2. A last pixel that it covers in part is left out: with an edge there, nearly all of
+            the range pixel is on one side, and so is its range. Never less than one: at an edge that pixel itself
+            shows both sides.
     """
-    T_dst_src = inverse(rig[dst].transform) @ rig[src].transform
-    baseline_m = float(np.linalg.norm(T_dst_src[:3, 3]))
-    calibration = calibration_bound_px(rig, src=src, dst=dst) / min(rig[dst].camera.focal_px)
-    bound_m = STRETCH_MAX * (baseline_m * (sigma_m / range_m) + calibration * (range_m + baseline_m))
-    return np.asarray(bound_m <= limit_m)
 
+    baseline_m: float
+    calibration: float
+    """Standard deviation by calibration, as a tangent."""
+    fixed_px: float
+    """Reach without the range's noise."""
+    moved_px: float
+    """Pixels by which a range's noise of 1 m moves a point at 1 m."""
 
-def reach_px_of(range_m: Floats, sigma_m: Floats, rig: Rig, *, src: str, dst: str) -> npt.NDArray[np.int32]:
-    """(N,) whole pixels of `dst`, to each side, that a pixel of the range camera may cover there.
-
-    Half a range pixel, `CALIBRATION_SIGMAS` of calibration, and one of the range's noise, which moves it along the
-    baseline's image by f t sigma / d^2. A last pixel that it covers in part is left out: with an edge there, nearly all
-    of the range pixel is on one side, and so is its range. Never less than one: at an edge that pixel itself shows both
-    sides.
-    """
-    focal_px, T_dst_src = max(rig[dst].camera.focal_px), inverse(rig[dst].transform) @ rig[src].transform
-    half_px = 0.5 * focal_px / max(rig[src].camera.focal_px)
-    fixed_px = min(half_px + CALIBRATION_SIGMAS * calibration_bound_px(rig, src=src, dst=dst), float(REACH_MAX_PX))
-    moved_px = focal_px * float(np.linalg.norm(T_dst_src[:3, 3])) * sigma_m / np.square(range_m)
-    return np.asarray(np.clip(np.floor(fixed_px + moved_px), 1, REACH_MAX_PX), dtype=np.int32)
+    @classmethod
+    def of(cls, rig: Rig, *, src: str, dst: str) -> Self:
+        """Bounds for the samples of `dst` at the points of the range camera `src`."""
+        T_dst_src, focals_px = inverse(rig[dst].transform) @ rig[src].transform, rig[dst].camera.focal_px
+        baseline_m, calibration_px = (
+            float(np.linalg.norm(T_dst_src[:3, 3])),
+            calibration_bound_px(rig, src=src, dst=dst),
+        )
+        half_px = 0.5 * max(focals_px) / max(rig[src].camera.focal_px)
+        fixed_px = min(half_px + CALIBRATION_SIGMAS * calibration_px, float(REACH_MAX_PX))
+        return cls(baseline_m, calibration_px / min(focals_px), fixed_px, max(focals_px) * baseline_m)

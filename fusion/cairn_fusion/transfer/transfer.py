@@ -8,8 +8,11 @@ of the coarse camera. In so wide a bin a slanted surface, such as the floor far 
 known from the neighbours in the range image.
 """
 
+import math
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import lru_cache
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
@@ -20,9 +23,7 @@ from cairn_calib.rig.lidar import AnyCamera
 from cairn_calib.rig.poses import Transform, inverse, transform_points
 from cairn_calib.rig.rig import Rig
 from cairn_fusion.transfer.transfer_kernels import hide_into, project_into, steps_of
-from cairn_map.arrays import Floats
-
-Pixels = npt.NDArray[np.int64]
+from cairn_map.arrays import Floats, Int32s
 
 BIN_MARGIN = 1.5
 """Bin width over the spacing of projected range pixels: they spread a little with obliqueness."""
@@ -55,9 +56,9 @@ class Label(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Transfer:
-    """Pixels of points in a camera's image: (N, 2) int64 (x, y), valid where the label is OK; and (N,) labels."""
+    """Pixels of points in a camera's image: (2, N) x and y, valid where the label is OK; and (N,) labels."""
 
-    pixels: Pixels
+    pixels: Int32s
     labels: npt.NDArray[np.uint8]
 
     @property
@@ -67,7 +68,7 @@ class Transfer:
 
     def sample(self, image: npt.NDArray[np.generic]) -> npt.NDArray[np.generic]:
         """(M, ...) values of the image at the M points with label OK, nearest pixel."""
-        x, y = self.pixels[self.ok].T
+        x, y = self.pixels[:, self.ok]
         return np.asarray(image[y, x])
 
 
@@ -107,52 +108,83 @@ def depth_steps(points: Floats) -> Floats:
     return steps_of(np.ascontiguousarray(points[..., 2]))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraPair:
+    """A range camera and another camera of its rig, with what the transfer of every scan needs."""
+
+    T_dst_src: Transform
+    """Eq. 5's transform: source camera to rig to destination camera."""
+    seen_by: AnyCamera
+    pinhole: tuple[Floats, Floats, float, int, int] | None
+    """Arguments of `project_into`; None for lenses that it does not know."""
+    bins: tuple[float, int, int, int] | None
+    """Range pixels along a bin, its edge in pixels, columns and rows; None: nothing can hide anything."""
+
+    @classmethod
+    def of(cls, rig: Rig, *, src: str, dst: str) -> Self:
+        """The pair of the range camera `src` and the camera `dst`."""
+        T_dst_src, seen_by = inverse(rig[dst].transform) @ rig[src].transform, rig[dst].camera
+        pinhole = bins = None
+        # Eq. 6: the kernel knows the lens that nearly all cameras have.
+        if isinstance(seen_by, Camera) and len(seen_by.distortion) == KERNEL_COEFFICIENTS:
+            lens, coefficients = np.array([*seen_by.focal_px, *seen_by.centre_px]), np.array(seen_by.distortion)
+            limit = _square_limit(radius_limit(seen_by.distortion))
+            pinhole = (lens, coefficients, limit, seen_by.width, seen_by.height)
+        if not _same_centre(T_dst_src):
+            # Bins as wide as the points are apart. A slant is that along one range pixel, of which a bin spans
+            # bin_px / ratio.
+            ratio = seen_by.focal_px[0] / rig[src].camera.focal_px[0]
+            bin_px = int(np.ceil(BIN_MARGIN * max(ratio, 1)))
+            bins = (bin_px / ratio, bin_px, -(-seen_by.width // bin_px), -(-seen_by.height // bin_px))
+        return cls(T_dst_src, seen_by, pinhole, bins)
+
+
 def transfer_points(
     points_src: Floats,
-    rig: Rig,
+    pair: CameraPair,
     *,
-    src: str,
-    dst: str,
     steps_m: Floats | None = None,
     hidden_behind_m: float = DEPTH_TOLERANCE_M,
 ) -> Transfer:
-    """Pixels of one camera's points in another's image, and their labels.
+    """Pixels of a range camera's points in another camera's image, and their labels.
 
     Args:
-        points_src: (N, 3), metres, frame of camera `src`; NaN for no range.
-        rig: with both cameras.
-        src: the range camera.
-        dst: the camera whose image is searched.
+        points_src: (3, N), metres, frame of the range camera; NaN for no range.
+        pair: both cameras.
         steps_m: (N,) `depth_steps` of the points; None: surfaces that face the camera.
         hidden_behind_m: depth behind the nearest point of its bin beyond which a point is hidden, besides 5 % and
             slant; infinite: none is.
     """
-    # Eq. 5's transform: source camera to rig to destination camera.
-    T_dst_src, seen_by = inverse(rig[dst].transform) @ rig[src].transform, rig[dst].camera
-    N = len(points_src)
-    pixels, depth_m, labels = np.empty((N, 2), np.int64), np.empty(N), np.empty(N, np.uint8)
+    N = points_src.shape[1]
+    pixels, depth_m, labels = np.empty((2, N), np.int32), np.empty(N), np.empty(N, np.uint8)
     # Stage 1: into the other camera's frame (Eq. 5) and image (Eq. 6).
-    if isinstance(seen_by, Camera) and len(seen_by.distortion) == KERNEL_COEFFICIENTS:
-        lens = np.array([*seen_by.focal_px, *seen_by.centre_px])
-        coefficients, limit = np.array(seen_by.distortion), radius_limit(seen_by.distortion)
-        points, size = np.ascontiguousarray(points_src, dtype=np.float64), (seen_by.width, seen_by.height)
-        project_into(pixels, depth_m, labels, points, T_dst_src, lens, coefficients, limit, *size)
+    if pair.pinhole is not None:
+        points = np.ascontiguousarray(points_src, dtype=np.float64)
+        project_into(pixels, depth_m, labels, points, pair.T_dst_src, *pair.pinhole)
     else:
         # Other lenses: the same by their own projection.
-        points = transform_points(T_dst_src, points_src)
-        exact = seen_by.project(points)
-        seen = seen_by.contains(exact)
+        points = transform_points(pair.T_dst_src, points_src.T)
+        exact = pair.seen_by.project(points)
+        seen = pair.seen_by.contains(exact)
         labels[:] = np.where(np.isnan(points[:, 2]), Label.NO_RANGE, np.where(seen, Label.OK, Label.OUT_OF_VIEW))
-        pixels[:], depth_m[:] = np.rint(np.where(seen[:, None], exact, 0)), np.linalg.norm(points, axis=1)
-    # Stage 2: occlusion, by a z-buffer with bins as wide as the points are apart.
-    if not _same_centre(T_dst_src):
-        # `steps_m` is the slant along one range pixel, of which a bin spans bin_px / ratio.
-        ratio = seen_by.focal_px[0] / rig[src].camera.focal_px[0]
-        bin_px = int(np.ceil(BIN_MARGIN * max(ratio, 1)))
-        slant_m = np.zeros(N) if steps_m is None else steps_m * (bin_px / ratio)
-        bins = (-(-seen_by.width // bin_px), -(-seen_by.height // bin_px))
-        hide_into(labels, pixels, depth_m, slant_m, bin_px, *bins, DEPTH_TOLERANCE, hidden_behind_m)
+        pixels[:], depth_m[:] = np.rint(np.where(seen[:, None], exact, 0)).T, np.linalg.norm(points, axis=1)
+    # Stage 2: occlusion, by a z-buffer.
+    if pair.bins is not None:
+        slant_m = np.zeros(N) if steps_m is None else steps_m
+        hide_into(labels, pixels, depth_m, slant_m, *pair.bins, DEPTH_TOLERANCE, hidden_behind_m)
     return Transfer(pixels, labels)
+
+
+@lru_cache(maxsize=64)
+def _square_limit(radius: float) -> float:
+    """The least square whose root, as it is rounded, is not less than a radius: no root need be taken of each point."""
+    # From below, step by step: the product is at most a few steps off.
+    square = radius * radius
+    while math.sqrt(square) >= radius:
+        square = math.nextafter(square, 0.0)
+    while math.sqrt(square) < radius:
+        square = math.nextafter(square, math.inf)
+    return square
 
 
 def _same_centre(T_dst_src: Transform) -> bool:

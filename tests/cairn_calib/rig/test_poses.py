@@ -11,6 +11,7 @@ from cairn_calib.rig.poses import (
     inverse,
     look_at,
     quaternion_from_transform,
+    quaternions_from_transforms,
     transform_from_quaternion,
     transform_points,
 )
@@ -35,6 +36,13 @@ def test_a_quaternion_comes_back_from_its_transform(t: tuple[float, ...], q: np.
     assert abs(abs(again @ q) - 1) < 1e-12
     np.testing.assert_allclose(transform_from_quaternion(t, again), T, atol=1e-12)
     assert tuple(T[:3, 3]) == t
+
+
+@law
+@given(st.lists(transforms, max_size=5))
+def test_quaternions_of_many_transforms_are_those_of_each_to_the_last_bit(every: list[Transform]) -> None:
+    together = quaternions_from_transforms(np.array(every).reshape(-1, 4, 4))
+    assert together.tolist() == [quaternion_from_transform(T).tolist() for T in every]
 
 
 def test_a_quaternion_turns_as_it_says() -> None:

@@ -20,7 +20,11 @@ from cairn_fusion.mapping.clear_kernels import (
     GRAZING_SHARE,
     SLANT_SHARE,
     bridge_gaps_into,
+    interpolated,
     nearest_around,
+    shown_in_window,
+    sort_ranges_into,
+    stay_before_into,
 )
 from cairn_fusion.mapping.integrate import Integration, Integrator, Method, integrate_scan
 from cairn_fusion.recording.scan import Scan
@@ -317,3 +321,54 @@ def test_points_without_order_leave_the_body_out_and_keep_from_surfaces() -> Non
 def test_the_text_of_an_integrator_names_all_that_it_does() -> None:
     others = ({"noise_sigmas": 3.0}, {"method": Method.CAST}, {"sample_spread_voxels": 0.5}, {"flying_step_m": 1.0})
     assert len({str(LIMITS), *(str(replace(LIMITS, **other)) for other in others)}) == 5  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("nodes", [((0.0, 0.02),), ((0.0, 0.005), (3.0, 0.01), (6.0, 0.03)), ((1.0, 0.1), (1.5, 0.0))])
+def test_noise_between_nodes_is_that_of_numpy_to_the_last_bit(nodes: tuple[tuple[float, float], ...]) -> None:
+    given = np.random.default_rng(1).uniform(-1, 9, 200).astype(np.float32)
+    given[:9] = np.nan, np.inf, -np.inf, 0.0, -0.0, 1.0, 1.5, 3.0, 6.0
+    x, y = np.array(nodes).T.copy()
+    found = interpolated(given, np.array([x, y]))
+    # NumPy has a number for NaN where there is a single node.
+    assert np.isnan(found[0])
+    np.testing.assert_array_equal(found[1:], np.interp(given[1:], x, y))
+
+
+def test_pixels_are_sorted_by_what_came_back() -> None:
+    rng = np.random.default_rng(2)
+    true_m = rng.choice(np.array([np.nan, np.inf, 0.0, 0.05, 0.1, 0.5, 3.0, 10.0, 10.5], np.float32), (9, 13))
+    full, flying = rng.random((2, 9, 13)) < 0.3
+    with np.errstate(invalid="ignore"):
+        near, far, void = true_m < np.float32(0.1), true_m > 10, np.isnan(true_m)
+    within = ~(near | far | void | full)
+    for is_clear in (False, True):
+        range_m, shield_m, silent, missing = (np.empty((9, 13), kind) for kind in (np.float32, np.float32, bool, bool))
+        counts = sort_ranges_into(
+            range_m, shield_m, silent, missing, true_m, full, flying, np.float32(0.1), np.float32(10), is_clear
+        )
+        np.testing.assert_array_equal(shield_m, np.where(within, true_m, np.nan))
+        np.testing.assert_array_equal(range_m, np.where(within & ~flying, true_m, np.nan))
+        np.testing.assert_array_equal(silent, void & ~full & is_clear)
+        np.testing.assert_array_equal(missing, void & ~full & (not is_clear))
+        causes = [within & ~flying, void & ~full, full, near & ~full, far & ~full, within & flying]
+        assert counts == tuple(int(cause.sum()) for cause in causes)
+        assert sum(counts) == true_m.size
+
+
+def test_clear_ranges_end_a_margin_before_the_nearest_one() -> None:
+    rng = np.random.default_rng(3)
+    nearest_m, share = rng.uniform(0, 0.4, (2, 7, 5)).astype(np.float32) * np.float32(5)
+    sigma_m = rng.uniform(0, 0.1, (7, 5))
+    margin_m = np.maximum(0.04, 2.0 * sigma_m).astype(np.float32)
+    expected = np.maximum(nearest_m - share * margin_m, np.float32(0))
+    stay_before_into(nearest_m, share, sigma_m, 0.04, 2.0)
+    np.testing.assert_array_equal(nearest_m, expected)
+    assert (nearest_m == 0).any() and (nearest_m > 0).any()
+
+
+def test_a_window_shows_the_pixels_of_the_camera_and_nothing_around_them() -> None:
+    clear_m = np.arange(1, 7, dtype=np.float32).reshape(2, 3)
+    pixel_of = np.array([6, 0, 5, 2, 2, 6], np.int32)  # 6: outside the camera's image
+    shown = shown_in_window(clear_m, pixel_of, 3, 2)
+    np.testing.assert_array_equal(shown[1:-1, 1:-1], [[0, 1], [6, 3], [3, 0]])
+    assert shown.shape == (5, 4) and shown.sum() == shown[1:-1, 1:-1].sum()

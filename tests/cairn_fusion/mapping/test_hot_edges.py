@@ -28,22 +28,28 @@ from cairn_sim.scene.solids import Box, Cylinder, Shape, Solid, placed
 from cairn_sim.scene.surfaces import Material, Optics, Surface
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_doubted_points_are_those_with_a_step_around_them(seed: int) -> None:
-    rng = np.random.default_rng(seed)
+@pytest.mark.parametrize("count", [5, 60, 400])
+@pytest.mark.parametrize("usual", [1, 2])
+def test_doubted_points_are_those_with_a_step_around_them(usual: int, count: int) -> None:
+    """With few points each looks around itself; with many all pixels do at once, for the usual reach."""
+    rng = np.random.default_rng(count + usual)
     image = (290 + 3 * rng.random((12, 15))).astype(np.float32)
-    image[4:7, 5:9], image[10, 2] = 310, np.nan
-    pixels = np.stack([rng.integers(0, 15, 60), rng.integers(0, 12, 60)], axis=1)
-    labels, reach_px = rng.choice([0, 0, 0, 1, 2], 60).astype(np.uint8), rng.integers(0, 3, 60).astype(np.int32)
+    image[4:7, 5:9], image[10, 2], image[0:5, 11:] = 310, np.nan, np.nan
+    pixels = np.stack([rng.integers(0, 15, count), rng.integers(0, 12, count)]).astype(np.int32)
+    labels, more_px = rng.choice([0, 0, 0, 1, 2], count).astype(np.uint8), rng.choice([0, 0, 1, 3, 20], count)
     expected = labels.copy()
-    for n, (x, y) in enumerate(pixels.tolist()):
-        r = int(reach_px[n])
+    for n, (x, y) in enumerate(pixels.T.tolist()):
+        # At least one pixel, at most 16.
+        r = int(np.clip(usual - 1 + more_px[n], 1, 16))
         around = image[max(y - r, 0) : y + r + 1, max(x - r, 0) : x + r + 1]
         if labels[n] == Label.OK and not np.isnan(around).all() and np.nanmax(around) - np.nanmin(around) > 4.0:
             expected[n] = Label.UNCERTAIN
-    doubt_edges_into(labels, pixels, reach_px, image, 4.0)
+    range_m = rng.uniform(0.5, 5.0, count)
+    # Half a pixel more, so that rounding decides nothing.
+    sigma_m = (more_px + 0.25) * range_m**2 / 7.0
+    doubt_edges_into(labels, pixels, range_m, sigma_m, usual - 0.75, 7.0, image, 4.0)
     np.testing.assert_array_equal(labels, expected)
-    assert 3 < (labels == Label.UNCERTAIN).sum() < 50
+    assert count == 5 or 0.05 < (labels == Label.UNCERTAIN).mean() < 0.6
 
 
 def test_a_hot_pipe_before_a_wall_keeps_its_temperature_and_the_wall_its_own() -> None:

@@ -12,7 +12,7 @@ from cairn_calib.rig.poses import inverse, transform_points
 from cairn_calib.rig.rig import MountedCamera, Rig, Spectrum, mount_camera
 from cairn_fusion.transfer.calibration_covariance import place_gradients
 from cairn_fusion.transfer.covariance_grid import CovarianceGrid, calibration_bound_px
-from cairn_fusion.transfer.pixel_covariance import pixel_covariance, reach_px_of
+from cairn_fusion.transfer.pixel_covariance import PlaceBounds, pixel_covariance
 from cairn_map.errors import BadInputError
 from cairn_sim.robots.heads import full_head
 
@@ -132,13 +132,16 @@ def test_a_lidar_has_no_lens_to_look_from() -> None:
 
 
 def test_a_range_pixel_covers_half_of_itself_to_each_side_and_what_is_uncertain() -> None:
+    def reach_px(rig: Rig, range_m: float, sigma_m: float) -> float:
+        bounds = PlaceBounds.of(rig, src="tof", dst="thermal_left")
+        return bounds.fixed_px + bounds.moved_px * sigma_m / range_m**2
+
     plain = Rig(name="r", cameras={name: full_head()[name] for name in NAMES})
-    far, near = reach_px_of(np.array([5.0, 0.5]), np.array([0.01, 0.05]), plain, src="tof", dst="thermal_left").tolist()
-    assert far == 1  # 3.6 / 2, and 0.02 from noise
-    assert near == int(1.82 + 465 * 0.085 * 0.05 / 0.25)
-    # Of a thermal camera with larger pixels than the range camera one pixel, for each may show both sides of an edge.
+    assert int(reach_px(plain, 5.0, 0.01)) == 1  # 3.6 / 2, and 0.02 from noise
+    assert int(reach_px(plain, 0.5, 0.05)) == int(1.82 + 465 * 0.085 * 0.05 / 0.25)
+    # A thermal camera with larger pixels than the range camera's: less than one of them.
     coarse = plain.model_copy(
         update={"cameras": {**plain.cameras, "thermal_left": full_head(scale=0.2)["thermal_left"]}}
     )
-    assert reach_px_of(np.array([5.0]), np.array([0.01]), coarse, src="tof", dst="thermal_left")[0] == 1
-    assert reach_px_of(np.array([5.0]), np.array([0.01]), RIG, src="tof", dst="thermal_left")[0] > 2
+    assert 0 < reach_px(coarse, 5.0, 0.01) < 1
+    assert reach_px(RIG, 5.0, 0.01) > 3

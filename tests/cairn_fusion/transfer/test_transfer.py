@@ -9,7 +9,7 @@ from cairn_calib.rig.fisheye import FisheyeCamera
 from cairn_calib.rig.lens import Lens
 from cairn_calib.rig.poses import look_at
 from cairn_calib.rig.rig import Rig, Spectrum, mount_camera
-from cairn_fusion.transfer.transfer import Label, depth_steps, points_from_range, transfer_points
+from cairn_fusion.transfer.transfer import CameraPair, Label, depth_steps, points_from_range, transfer_points
 from cairn_map.errors import BadInputError
 
 Floats = npt.NDArray[np.float64]
@@ -77,22 +77,24 @@ def test_a_range_image_of_another_size_is_refused() -> None:
 
 
 def test_equations_5_and_6_place_a_point_in_the_other_image() -> None:
-    transfer = transfer_points(np.array([[0.3, -0.2, 2.0]]), rig(shift_m=(0.1, 0.0, 0.0)), src="tof", dst="colour")
+    transfer = transfer_points(
+        np.array([[0.3], [-0.2], [2.0]]), CameraPair.of(rig(shift_m=(0.1, 0.0, 0.0)), src="tof", dst="colour")
+    )
     x, y = 140 * (0.3 - 0.1) / 2 + 79.5, 140 * -0.2 / 2 + 59.5
-    assert transfer.pixels.tolist() == [[round(x), round(y)]]
+    assert transfer.pixels.tolist() == [[round(x)], [round(y)]]
     assert transfer.labels.tolist() == [Label.OK]
 
 
 def test_every_point_has_a_label() -> None:
     points = np.array([[0, 0, 2.0], [0, 0, -2.0], [50, 0, 2.0], [np.nan] * 3])
-    transfer = transfer_points(points, rig(), src="tof", dst="colour")
+    transfer = transfer_points(points.T, CameraPair.of(rig(), src="tof", dst="colour"))
     assert transfer.labels.tolist() == [Label.OK, Label.OUT_OF_VIEW, Label.OUT_OF_VIEW, Label.NO_RANGE]
 
 
 def test_samples_are_the_nearest_pixels_of_the_points_that_are_seen() -> None:
     image = np.arange(120 * 160).reshape(120, 160)
     points = np.array([[0, 0, 1.0], [0, 0, -1.0], [0.01, 0, 1.0]])
-    transfer = transfer_points(points, rig(), src="tof", dst="colour")
+    transfer = transfer_points(points.T, CameraPair.of(rig(), src="tof", dst="colour"))
     x = [80, 81]  # 79.5 rounds to even; 79.5 + 1.4
     assert transfer.sample(image).tolist() == [image[60, x[0]], image[60, x[1]]]
 
@@ -128,7 +130,7 @@ def test_cameras_with_one_centre_hide_nothing_from_each_other() -> None:
         "tof": mount_camera(Spectrum.RANGE, TOF, np.eye(4)),
         "thermal": mount_camera(Spectrum.THERMAL, COLOUR, turned),
     }
-    transfer = transfer_points(points, Rig(name="head", cameras=cameras), src="tof", dst="thermal")
+    transfer = transfer_points(points.T, CameraPair.of(Rig(name="head", cameras=cameras), src="tof", dst="thermal"))
     assert transfer.ok.all()
 
 
@@ -140,7 +142,7 @@ def test_a_displaced_camera_does_not_see_what_the_front_plane_hides(shift_m: flo
     ranges = ranges_to_planes(TOF, [(FRONTAL, near_m, -edge_m, edge_m), (FRONTAL, far_m, *EVERYWHERE)])
     image_points = points_from_range(ranges, TOF)
     points, steps_m = image_points.reshape(-1, 3), depth_steps(image_points).ravel()
-    transfer = transfer_points(points, head, src="tof", dst="colour", steps_m=steps_m)
+    transfer = transfer_points(points.T, CameraPair.of(head, src="tof", dst="colour"), steps_m=steps_m)
     # Where the line from the colour camera to a far point crosses the near plane.
     crossing = shift_m + (points[:, 0] - shift_m) * near_m / points[:, 2]
     far = points[:, 2] > 2
@@ -163,7 +165,7 @@ def test_a_slanted_plane_hides_nothing_of_itself(tilt_deg: float, camera: Camera
     points = points_from_range(np.where(ranges < 6, ranges, np.nan), camera)
     head = rig(camera, shift_m=(0.1, 0.05, 0.0))
     transfer = transfer_points(
-        points.reshape(-1, 3), head, src="tof", dst="colour", steps_m=depth_steps(points).ravel()
+        points.reshape(-1, 3).T, CameraPair.of(head, src="tof", dst="colour"), steps_m=depth_steps(points).ravel()
     )
     assert not (transfer.labels == Label.OCCLUDED).any()
     assert transfer.ok.sum() > 300
@@ -196,11 +198,11 @@ def test_points_appear_where_the_camera_says(camera: Lens) -> None:
     rig = Rig(name="two", cameras=cameras)
     points = np.random.default_rng(4).uniform(-3, 3, (4000, 3))
     points[:50] = np.nan
-    transfer = transfer_points(points, rig, src="tof", dst="seen")
+    transfer = transfer_points(points.T, CameraPair.of(rig, src="tof", dst="seen"))
     exact = camera.project(points - beside[:3, 3])
     inside = camera.contains(exact)
     in_view = np.isin(transfer.labels, [Label.OK, Label.OCCLUDED])
     assert 50 < inside.sum() < 3000
     np.testing.assert_array_equal(in_view, inside)
-    np.testing.assert_array_equal(transfer.pixels[inside], np.rint(exact[inside]).astype(np.int64))
+    np.testing.assert_array_equal(transfer.pixels.T[inside], np.rint(exact[inside]).astype(np.int64))
     assert (transfer.labels[:50] == Label.NO_RANGE).all()

@@ -14,7 +14,8 @@ from cairn_map.codec.entropy.neighbour_kernels import NONE, STEPS, earlier_rows,
 from cairn_map.codec.octree.cell_content import content_of
 from cairn_map.codec.octree.octree import build_octree
 from cairn_map.codec.octree.octree_kernels import leaves_of_rows, list_leaves_into, measure_masks
-from cairn_map.evidence.evidence import Evidence
+from cairn_map.evidence.channels import TEMPERATURE
+from cairn_map.evidence.evidence import Evidence, packed_evidence
 from cairn_map.evidence.grid import Geometry
 
 DEEP = Geometry(depth=6, channels=())
@@ -122,3 +123,24 @@ def test_the_steps_are_all_that_can_come_before() -> None:
 def test_content_of_a_surface_has_its_samples_at_voxels(geometry: Geometry) -> None:
     content = content_of(surface_evidence(1, geometry), geometry)
     assert (content.octree.sizes[content.sampled] == 1).all()
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("depth", [3, 4])
+def test_blocks_of_equal_voxels_collapse_as_in_the_slow_tree(depth: int, seed: int) -> None:
+    """Nodes of 8, 64 and 512 voxels that are all alike, but for a voxel that is missing, differs or has a sample."""
+    rng, geometry = np.random.default_rng(seed), Geometry(depth=depth, channels=(TEMPERATURE,))
+    voxels = np.arange(8**depth, dtype=np.uint32)
+    blocks = rng.choice([8, 64, 512])
+    counts = np.stack([np.zeros(len(voxels)), rng.integers(1, 3, 8**depth)[voxels // blocks]], axis=1).astype(np.int32)
+    counts[rng.integers(0, len(voxels), seed)] = 1, 7
+    samples = np.zeros((len(voxels), geometry.plane_count), np.int64)
+    samples[rng.integers(0, len(voxels), seed // 2)] = 4, 16, 1
+    kept = np.sort(rng.permutation(len(voxels))[seed // 3 :])
+    evidence = packed_evidence(voxels[kept], counts[kept], samples[kept], geometry)
+    octree, rows = build_octree(evidence, depth=depth)
+    root = naive_octree.tree_of(as_dict(evidence), depth)
+    assert (bytes(octree.child_masks), bytes(octree.leaf_masks)) == naive_octree.masks_of(root, depth)
+    found = zip(octree.starts.tolist(), octree.sizes.tolist(), strict=True)
+    assert list(found) == [(place, size) for place, size, _ in naive_octree.leaves_of(root, depth)]
+    assert evidence.voxels[rows].tolist() == octree.starts.tolist()
