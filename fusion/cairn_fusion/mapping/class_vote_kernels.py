@@ -12,9 +12,9 @@ tests/cairn_fusion/mapping/test_class_votes.py has the slow twin.
 """
 
 import numba as nb
-import numpy as np
 
 from cairn_map.arrays import Bytes, Int32s, Ints
+from cairn_map.kernels.integer_kernels import signed
 
 
 @nb.njit(cache=True, nogil=True)
@@ -55,7 +55,7 @@ def count_pixels_into(
             # The voxel's row: probes go on from slot to slot until it, or a free one, is met.
             slot = hash_of(x, y, z) & mask
             while slots[slot] != 0:
-                row = np.int64(slots[slot]) - 1
+                row = signed(slots[slot]) - 1
                 if (known[row, 0] == x) & (known[row, 1] == y) & (known[row, 2] == z):
                     break
                 slot = (slot + 1) & mask
@@ -66,9 +66,9 @@ def count_pixels_into(
                 slots[slot] = rows
                 row = rows - 1
         # Its pair for the class.
-        pair = np.int64(heads[row]) - 1
+        pair = signed(heads[row]) - 1
         while pair >= 0 and classes[pair] != shown[n]:
-            pair = np.int64(nexts[pair]) - 1
+            pair = signed(nexts[pair]) - 1
         if pair < 0:
             pair = pairs
             nexts[pair], classes[pair], pixels[pair] = heads[row], shown[n], 0
@@ -100,15 +100,15 @@ def votes_into(
     """
     for row in range(len(heads)):
         total, first, second, winner = 0, 0, 0, 0
-        pair = heads[row] - 1
+        pair = signed(heads[row]) - 1
         while pair >= 0:
-            count = pixels[pair]
+            count = signed(pixels[pair])
             total += count
             if count > first or (count == first and classes[pair] < winner):
-                second, first, winner = first, count, np.int64(classes[pair])
+                second, first, winner = first, count, signed(classes[pair])
             elif count > second:
                 second = count
-            pair = nexts[pair] - 1
+            pair = signed(nexts[pair]) - 1
         lead = first - second
         share = (most * lead + total - 1) // total
         winners[row], weights[row] = winner, max(1, min(lead, share))
@@ -127,5 +127,5 @@ def add_votes_into(sums: Ints, at: Ints, winners: Ints, weights: Ints) -> None:
 @nb.njit(nogil=True, forceinline=True)
 def hash_of(x: int, y: int, z: int) -> int:
     """A number from 0 of a voxel, whose lower bits differ for neighbours (Teschner et al. 2003, mixed once more)."""
-    mixed = (np.int64(x) * 73856093) ^ (np.int64(y) * 19349663) ^ (np.int64(z) * 83492791)
+    mixed = (signed(x) * 73856093) ^ (signed(y) * 19349663) ^ (signed(z) * 83492791)  # type: ignore[arg-type]
     return (mixed ^ (mixed >> 15)) & 0x7FFFFFFFFFFFFFFF

@@ -230,8 +230,8 @@ def check_cubes(geometry: Geometry) -> None:
     if geometry.is_flat:
         raise BadInputError(
             "level_layer",
-            "this layer is a level: it answers points, slices, height maps and elevation. For rays, obstacles, free "
-            "space and pictures ask a layer of cubic voxels",
+            "this layer is a level: it answers points, slices, height maps, elevation and pictures. For rays, "
+            "obstacles, free space and overlays ask a layer of cubic voxels",
         )
 
 
