@@ -12,8 +12,9 @@ from cairn_fusion.mapping.integrate import Integrator, Method, integrate_scan, i
 from cairn_fusion.mapping.ray_casting import carried
 from cairn_fusion.recording.scan import Scan
 from cairn_fusion.transfer.covariance_grid import CovarianceGrid
+from cairn_map.evidence.channels import classes_channel
 from cairn_map.evidence.evidence_map import EvidenceMap
-from cairn_map.evidence.grid import Geometry, level_geometry
+from cairn_map.evidence.grid import Geometry, geometry_for, level_geometry
 from cairn_map.queries.map_snapshot import snapshot_of
 from cairn_map.render.camera_rays import CameraRays
 from cairn_map.render.map_render import MapRenderer
@@ -44,6 +45,9 @@ def warm_up() -> None:
     integrate_scan(scan, rig, Geometry(), integrator=Integrator(method=Method.CAST))
     carried(np.zeros((1, 3)), np.eye(4))  # points of a sweep
     integrate_scan(scan, rig, level_geometry(), integrator=Integrator())
+    labelled = replace(scan, labels={"tof": np.zeros((2, 2), np.uint8)}, label_names={0: "wall"})
+    classed = geometry_for(voxel_edge_m=0.05, channels=(classes_channel(("wall",)),))
+    integrate_scans([labelled, labelled], rig, classed, integrator=Integrator())
     decompress_into(np.zeros(2, np.uint8), np.zeros(1, np.uint8))
     covariance = CovarianceGrid.of(rig, src="tof", dst="colour")
     covariance.at(np.zeros((1, 2)), np.ones(1, np.float32), np.ones(1, np.float32))

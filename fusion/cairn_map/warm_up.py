@@ -42,12 +42,13 @@ from cairn_map.queries.layers.layered_snapshot import LayeredSnapshot
 from cairn_map.queries.map_snapshot import snapshot_of
 from cairn_map.queries.native.point_handle import PointHandle
 from cairn_map.render.camera_rays import look_at, pinhole
+from cairn_map.render.ground_picture import ground_cell, ground_of
 from cairn_map.render.map_picture import layer_picture, layer_values
 from cairn_map.render.map_render import MapRenderer
 from cairn_map.render.partial_map import ReadCell, draw_as_needed, read_cell
 from cairn_map.render.pose_spread import PoseSpread
 from cairn_map.render.render_kernels import blend_into
-from cairn_map.render.render_picture import SCALES, Layer
+from cairn_map.render.render_picture import GROUND_LAYERS, SCALES, Layer
 
 NICE = 10
 """Niceness of the processes that share the warm-up: work that is being done comes first."""
@@ -131,8 +132,12 @@ def warm_up_pictures() -> None:
     read = decode_canonical_cell(encode_cell(_key(), _many_voxels(), GEOMETRY).data).evidence
     reading = present(cell_history({BASE: read, Epoch(0): read}), GEOMETRY, model).evidence
     for cell in (brick_cell(GEOMETRY, [read]), reading_cell(GEOMETRY, reading, model)):
-        for layer in Layer:
+        for layer in [layer for layer in Layer if layer not in GROUND_LAYERS]:
             _draw(read_cell(cell, GEOMETRY, model, layer), model, layer)
+    level = level_geometry()
+    voted = packed_evidence(np.zeros(1, np.uint32), np.ones((1, 2), np.int32), np.ones((1, 2), np.int64), level)
+    ground = ground_of({_key(): ground_cell(voted, _key(), level, model)}, level)
+    ground.seen(pinhole(4, 4, focal_px=4), look_at((-1, 0.1, 0.1), (0, 0, 0)), range_max_m=2.0)
 
 
 SERVER_PARTS = {
@@ -142,7 +147,7 @@ SERVER_PARTS = {
     "pictures": warm_up_pictures,
 }
 """Parts that a server needs, the longest first (19, 8, 7 and 5 s of a core), so that processes may share them."""
-SERVER_KERNELS = 68
+SERVER_KERNELS = 70
 """Kernels that these parts compile, not counting those that others call."""
 CHECK_PARTS = ("models", "codec", "sums")
 """Those of them that a check of commits needs."""

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser
 from tests.console import ground
-from tests.console.browsing import Console, findings_of_axe, map_tab
+from tests.console.browsing import CHROMIUM, FLAGS, VIEW, Console, findings_of_axe, map_tab, tab
 from tests.console.hot_room import GEOMETRY, commit_of
 from tests.console.hot_room import room as warm_room
 from tests.console.room import ADMIN_TOKEN, Room
@@ -240,3 +240,25 @@ def test_classes_have_a_legend_and_the_voxel_names_its_own(console: Console) -> 
         voxel.get_by_text("(5 votes" if name == "wall" else "(1 vote").first.wait_for()
     assert findings_of_axe(console, "classes") == []
     assert console.errors == []
+
+
+def test_without_webgl_the_server_draws_the_level_by_what_hinders_a_vehicle(chromium: Browser, site: Room) -> None:
+    blind = chromium.browser_type.launch(executable_path=CHROMIUM, args=[FLAGS[0], "--disable-3d-apis"])
+    with blind.new_context(viewport=VIEW) as context:
+        console = tab(context, site)
+        console.open(f"#map={GROUND}")
+        console.log_in()
+        page = console.page
+        page.get_by_role("heading", name="This browser cannot draw the map").wait_for()
+        assert page.get_by_role("button", name="Colour").count() == 0
+        pictures = set()
+        for layer in ("Height", "Slope", "Step", "Difficulty"):
+            page.get_by_role("button", name=layer).click()
+            page.get_by_role("button", name=layer, pressed=True).wait_for()
+            picture = page.get_by_role("img", name="The map: from above")
+            picture.wait_for()
+            assert picture.evaluate("(image) => image.naturalWidth") == 640
+            pictures.add(picture.screenshot())
+        assert len(pictures) == 4
+        assert [said for said in console.errors if "401" not in said] == []
+    blind.close()

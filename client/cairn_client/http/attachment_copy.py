@@ -69,6 +69,9 @@ def attachment_bytes(attachment: Path | bytes | None) -> bytes:
 def _file_bytes(path: Path) -> bytes:
     try:
         with path.open("rb") as file:
-            return file.read(ATTACHMENT_BYTES_MAX + 1)
+            data = file.read(ATTACHMENT_BYTES_MAX + 1)
     except OSError as exc:
         raise BadInputError("bad_attachment", f"cannot read {path}: {exc.strerror}") from exc
+    if len(data) > ATTACHMENT_BYTES_MAX:
+        raise BadInputError("too_large", f"an attachment has at most {ATTACHMENT_BYTES_MAX} bytes, and {path} has more")
+    return data

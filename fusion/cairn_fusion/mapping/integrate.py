@@ -29,7 +29,7 @@ from cairn_calib.rig.poses import Transform, check_transform, inverse, transform
 from cairn_calib.rig.rig import LIDAR, LIDAR_REACH_M, TIME_OF_FLIGHT_REACH_M, MountedCamera, Rig
 from cairn_fusion.mapping.beam_returns import ReturnCounts, Returns, clear_image, returns_of
 from cairn_fusion.mapping.brick_tally import Each, TallyPool
-from cairn_fusion.mapping.class_votes import ClassVotes, classes_of_labels
+from cairn_fusion.mapping.class_votes import ClassVotes, classes_of_labels, without_classes
 from cairn_fusion.mapping.free_space import Window, carving_of, window_of
 from cairn_fusion.mapping.level.votes import votes_of
 from cairn_fusion.mapping.ray_casting import beam_evidence, carried, clear_ends, silent_ends
@@ -38,7 +38,6 @@ from cairn_fusion.recording.scan import Scan, check_scan
 from cairn_fusion.transfer.transfer import DEPTH_TOLERANCE_M
 from cairn_map.arrays import Floats
 from cairn_map.errors import BadInputError
-from cairn_map.evidence.brick_cell import sum_evidence
 from cairn_map.evidence.channels import ChannelKind
 from cairn_map.evidence.evidence import Evidence, packed_evidence
 from cairn_map.evidence.grid import CellKey, Geometry, split_voxels, voxels_of_points
@@ -131,11 +130,12 @@ class Integration:
     def __init__(self, rig: Rig, geometry: Geometry, integrator: Integrator, *, around_m: Floats | None = None) -> None:
         """Args: around_m: (3,) centre of the first tally, metres; None: the place of the first scan."""
         self._rig = rig
-        self._geometry = geometry
+        # Classes come with the votes alone: their planes would be carried through every sum.
+        self._geometry = without_classes(geometry)
         self._integrator = integrator
         # Room for images; sweeps of lidars are counted ray by ray, without a tally.
         reach_m = TIME_OF_FLIGHT_REACH_M if integrator.max_range_m is None else integrator.max_range_m
-        self._tallies = TallyPool(geometry, max_range_m=reach_m, around_m=around_m)
+        self._tallies = TallyPool(self._geometry, max_range_m=reach_m, around_m=around_m)
         self._votes = ClassVotes(geometry)
         # A sample whose place is less certain than this could be another voxel's.
         spread_m = integrator.sample_spread_voxels * geometry.voxel_edge_m
@@ -167,7 +167,7 @@ class Integration:
             flying_step_m=limits.flying_step_m if window is not None else math.inf,
         )
         # Stage 2: named readings and labels, checked before anything is counted.
-        scalars, classes = _scalar_evidence(scan, self._geometry), classes_of_labels(scan, self._geometry)
+        scalars, classes = _scalar_evidence(scan, self._geometry), classes_of_labels(scan, self._votes.geometry)
         # Stage 3: hits, samples and misses.
         sight = ImageTransfers(scan, returns, self._sampling)
         if self._geometry.is_flat:
@@ -241,11 +241,7 @@ class Integration:
 
     def diff(self, each: Each = map) -> dict[CellKey, Evidence]:
         """The evidence of all scans, by cell; `each` as for `Tally.packed`. Not while scans are being added."""
-        counted, votes = self._tallies.packed(each), self._votes.diff()
-        if not votes:
-            return counted
-        parts = {key: [diff[key] for diff in (counted, votes) if key in diff] for key in sorted({*counted, *votes})}
-        return {key: both[0] if len(both) == 1 else sum_evidence(both, self._geometry) for key, both in parts.items()}
+        return self._votes.joined(self._tallies.packed(each))
 
     def _add_sweep(self, scan: Scan, points: npt.NDArray[np.float32]) -> None:
         """Add a scan whose points have no raster, ray by ray."""

@@ -230,8 +230,8 @@ def check_cubes(geometry: Geometry) -> None:
     if geometry.is_flat:
         raise BadInputError(
             "level_layer",
-            "this layer is a level: it answers points, slices, height maps and elevation. For rays, obstacles, free "
-            "space and pictures ask a layer of cubic voxels",
+            "this layer is a level: it answers points, slices, height maps, elevation and pictures. For rays, "
+            "obstacles, free space and overlays ask a layer of cubic voxels",
         )
 
 
@@ -305,7 +305,9 @@ def voxels_of_points(points_m: npt.NDArray[np.floating], geometry: Geometry) -> 
     reach_m = (CELL_LIMIT - 1) * geometry.cell_edges_m[2]  # the least of the three
     if not (np.abs(points) < reach_m).all():  # also catches NaN
         raise BadInputError("point_range", f"points must be finite and within {reach_m:.0f} m of the origin")
-    voxels: Ints = np.rint(points * NANOMETRES).astype(np.int64) // (geometry.voxel_size_um() * 1000)
+    # Division by one number takes a third of the time of division by three.
+    size_um = geometry.voxel_size_um() if geometry.is_flat else geometry.voxel_edge_um
+    voxels: Ints = np.rint(points * NANOMETRES).astype(np.int64) // (size_um * 1000)
     return voxels
 
 

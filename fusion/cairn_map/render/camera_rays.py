@@ -139,11 +139,16 @@ def checked_pose(T_map_camera: npt.ArrayLike, *, reach_m: float) -> Floats:
 
 
 def cells_in_sight(
-    cells: npt.NDArray[np.int64], sight: CameraRays, T_map_camera: Floats, *, edge_m: float, range_max_m: float
+    cells: npt.NDArray[np.int64],
+    sight: CameraRays,
+    T_map_camera: Floats,
+    *,
+    edges_m: tuple[float, float, float],
+    range_max_m: float,
 ) -> npt.NDArray[np.bool_]:
     """(C,) False for those of (C, 3) cells that are certainly not seen: outside of the cone of all rays, or too far."""
-    half_m = edge_m * np.sqrt(3) / 2  # of the sphere around a cell
-    centres = ((cells + 0.5) * edge_m - T_map_camera[:3, 3]) @ T_map_camera[:3, :3]
+    half_m = float(np.linalg.norm(edges_m)) / 2  # of the sphere around a cell
+    centres = ((cells + 0.5) * edges_m - T_map_camera[:3, 3]) @ T_map_camera[:3, :3]
     away_m = np.linalg.norm(centres, axis=1)
     middle, widest = _span(sight)
     # Cells within range; then those whose sphere reaches into the cone around the middle ray.

@@ -13,10 +13,8 @@ import numpy.typing as npt
 from cairn_map.arrays import Floats
 from cairn_map.queries.level.elevation import STANDARD_VEHICLE, Elevation, Vehicle
 from cairn_map.render.map_picture import npz_of
-from cairn_map.render.render_picture import png_of
+from cairn_map.render.render_picture import BLOCKED, EASY, LIMIT, MIDDLE, png_of
 
-EASY, MIDDLE, LIMIT, BLOCKED = (46, 125, 50), (235, 200, 60), (214, 69, 48), (96, 16, 24)
-"""sRGB of difficulties 0, 0.5, 1, and more."""
 SHADE = 0.5
 """Change of brightness where the ground falls by its own width."""
 

@@ -46,6 +46,10 @@ TITLES = {
     Layer.DEPTH: "depth, m",
     Layer.AGE: "since the last change, s",
     Layer.COLOUR: "colour",
+    Layer.HEIGHT: "height, m",
+    Layer.SLOPE: "slope, degrees",
+    Layer.STEP: "step, m",
+    Layer.DIFFICULTY: "difficulty, limit 1",
 }
 
 

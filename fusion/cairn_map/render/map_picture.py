@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from cairn_map.arrays import Rgb
+from cairn_map.arrays import Floats, Rgb
+from cairn_map.errors import BadInputError
 from cairn_map.queries.map_snapshot import MapSnapshot
 from cairn_map.render.legend import with_legend, write_text_into
 from cairn_map.render.map_render import Changes, MapRenderer, SurfaceImage
@@ -32,7 +33,8 @@ def layer_values(
     NaN where nothing is seen, and where the node seen has no such value.
 
     Raises:
-        BadInputError: kind `unknown_channel`: the map has no temperatures, or no colours.
+        BadInputError: kinds `unknown_channel`: the map has no temperatures, or no colours; `not_level`: what level
+            layers alone have.
     """
     match layer:
         case Layer.DEPTH:
@@ -48,14 +50,34 @@ def layer_values(
                 return np.full_like(seen.range_m, np.nan)
             # What claims to be later than now is as new as anything.
             return np.maximum(ages.now - renderer.changed(snapshot, seen, ages.changes), 0)
+        case Layer.HEIGHT | Layer.SLOPE | Layer.STEP | Layer.DIFFICULTY:
+            raise no_ground(layer)
 
 
-def layer_picture(values: Values, seen: SurfaceImage, scale: Scale, spread: PoseSpread | None = None) -> Rgb:
+def no_ground(layer: Layer) -> BadInputError:
+    """The error of a layer of cubes that is asked for what level layers alone have, kind `not_level`."""
+    return BadInputError(
+        "not_level", f"a {layer} is drawn of a level layer: `cairn map layer add MAP NAME --kind level` makes one"
+    )
+
+
+def layer_picture(
+    values: Values,
+    seen: SurfaceImage,
+    scale: Scale,
+    spread: PoseSpread | None = None,
+    *,
+    shade: Floats | None = None,
+) -> Rgb:
     """(H + legend, W, 3) sRGB: values painted, grey where a node without a value is seen, dark where nothing is.
+
+    `shade` (H, W) multiplies the brightness of what is painted.
 
     With a pose's spread the picture is blurred as far as it may be off, or withheld where that is too far.
     """
     image = painted(values, scale)
+    if shade is not None:
+        image = np.rint(np.clip(image * np.nan_to_num(shade)[..., None], 0, 255)).astype(np.uint8)
     image[~seen.hit] = NOTHING
     if spread is not None:
         spread_px2 = spread.at(seen.sight, seen.range_m)
@@ -74,7 +96,8 @@ def layer_picture(values: Values, seen: SurfaceImage, scale: Scale, spread: Pose
 def arrays_of(
     values: Values, seen: SurfaceImage, layer: Layer, spread: PoseSpread | None = None
 ) -> dict[str, npt.NDArray[np.generic]]:
-    """Arrays by name: `range_m`, `depth_m`, and the layer's values (`temperature_k`, `age_s`, `probability`, `colour`).
+    """Arrays by name: `range_m`, `depth_m`, and the layer's values (`temperature_k`, `age_s`, `probability`, `colour`;
+    of a level `height_m`, `slope_deg`, `step_m`, `difficulty`).
 
     With a pose's spread also `spread_px2`, (H, W, 3): the covariance xx, xy, yy of where each pixel's content appears.
     All float32, NaN where nothing is seen or nothing is known.
@@ -87,7 +110,11 @@ def arrays_of(
             arrays["temperature_k"] = values.astype(np.float32) + np.float32(ZERO_CELSIUS_K)
         case Layer.AGE:
             arrays["age_s"] = values.astype(np.float32)
-        case Layer.PROBABILITY | Layer.COLOUR:
+        case Layer.HEIGHT | Layer.STEP:
+            arrays[f"{layer}_m"] = values.astype(np.float32)
+        case Layer.SLOPE:
+            arrays["slope_deg"] = values.astype(np.float32)
+        case Layer.PROBABILITY | Layer.COLOUR | Layer.DIFFICULTY:
             arrays[str(layer)] = values.astype(np.float32)
     return arrays
 

@@ -10,7 +10,7 @@ of a cell's nodes are computed once, when the first pixel needs them, and kept u
 """
 
 import math
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 
@@ -146,18 +146,7 @@ class MapRenderer:
 
     def changed(self, snapshot: MapSnapshot, seen: SurfaceImage, changes: Changes) -> Floats:
         """(H, W) time of the node's last change, in the unit of `changes`; NaN where that is unknown."""
-        # Cell by cell, because changes are held by cell.
-        H, W = seen.slots.shape
-        found, flat = np.full(H * W, np.nan), seen.slots.reshape(-1)
-        places, nodes = seen.places.reshape(-1), seen.nodes.reshape(-1)
-        for slot, key in enumerate(snapshot.frozen.keys):
-            if key in changes and len(rows := np.flatnonzero(flat == slot)):
-                # A place is a Morton code: without its lowest 6 bits the block, without 9 the brick.
-                blocks, brick = places[rows] >> np.uint32(6), changes[key].reshape(-1, 8)
-                is_brick = nodes[rows] == kernels.NODE_DEPTH  # the only node that is larger than a block
-                newest = np.fmax.reduce(brick[blocks >> np.uint32(3)], axis=1)
-                found[rows] = np.where(is_brick, newest, changes[key][blocks])
-        return found.reshape(H, W)
+        return changed_at(snapshot.frozen.keys, seen, changes)
 
     def _mean(self, snapshot: MapSnapshot, seen: SurfaceImage, channel: Channel, planes: int) -> Values:
         # The channel is the key of its table.
@@ -299,3 +288,19 @@ class MapRenderer:
         # Kernels release Python's lock, and each share writes rows of its own.
         with ThreadPoolExecutor(self._threads) as pool:
             list(pool.map(do, shares))
+
+
+def changed_at(keys: Sequence[CellKey], seen: SurfaceImage, changes: Changes) -> Floats:
+    """(H, W) time of the last change of what is seen, in the unit of `changes`; `keys`: of the cells, by slot."""
+    # Cell by cell, because changes are held by cell.
+    H, W = seen.slots.shape
+    found, flat = np.full(H * W, np.nan), seen.slots.reshape(-1)
+    places, nodes = seen.places.reshape(-1), seen.nodes.reshape(-1)
+    for slot, key in enumerate(keys):
+        if key in changes and len(rows := np.flatnonzero(flat == slot)):
+            # A place is a Morton code: without its lowest 6 bits the block, without 9 the brick.
+            blocks, brick = places[rows] >> np.uint32(6), changes[key].reshape(-1, 8)
+            is_brick = nodes[rows] == kernels.NODE_DEPTH  # the only node that is larger than a block
+            newest = np.fmax.reduce(brick[blocks >> np.uint32(3)], axis=1)
+            found[rows] = np.where(is_brick, newest, changes[key][blocks])
+    return found.reshape(H, W)

@@ -32,6 +32,8 @@ NO_VALUE = (112, 112, 112)
 """Colour of nodes without a value of the layer."""
 TEXT = (230, 230, 230)
 WARNING = (255, 210, 60)
+EASY, MIDDLE, LIMIT, BLOCKED = (46, 125, 50), (235, 200, 60), (214, 69, 48), (96, 16, 24)
+"""sRGB of difficulties 0, 0.5, 1, and more."""
 INFERNO = "000004160b39420a686a176e932667bc3754dd513af37819fca50af6d746fcffa4"
 VIRIDIS = "440154482475414487355f8d2a788e21918c22a88444bf707ad151bddf26fde725"
 """Eleven colours each, evenly spaced, of the palettes of these names (van der Walt and Smith)."""
@@ -47,6 +49,14 @@ class Layer(StrEnum):
     PROBABILITY = "probability"
     DEPTH = "depth"
     AGE = "age"
+    HEIGHT = "height"
+    SLOPE = "slope"
+    STEP = "step"
+    DIFFICULTY = "difficulty"
+
+
+GROUND_LAYERS = frozenset({Layer.HEIGHT, Layer.SLOPE, Layer.STEP, Layer.DIFFICULTY})
+"""Quantities of the ground, which level layers alone have."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,13 +80,25 @@ SCALES = {
     Layer.DEPTH: Scale(Layer.DEPTH, 0.0, 10.0),
     Layer.AGE: Scale(Layer.AGE, 0.0, 3600.0),
     Layer.COLOUR: Scale(Layer.COLOUR, 0.0, 255.0),
+    Layer.HEIGHT: Scale(Layer.HEIGHT, 0.0, 10.0),
+    Layer.SLOPE: Scale(Layer.SLOPE, 0.0, 45.0),
+    Layer.STEP: Scale(Layer.STEP, 0.0, 0.5),
+    Layer.DIFFICULTY: Scale(Layer.DIFFICULTY, 0.0, 1.0),
 }
-"""Default scale of each layer: degrees Celsius, 1, metres, seconds."""
+"""Default scale of each layer: degrees Celsius, 1, metres, seconds; of the ground metres, degrees, metres, 1."""
 
 
 @lru_cache(maxsize=8)
 def palette(layer: Layer) -> Rgb:
-    """(256, 3) colours from the low to the high end; of ages, the newest is the brightest."""
+    """(256, 3) colours from the low to the high end; of ages, the newest is the brightest; of difficulties, the last
+    one stands for all from the limit on.
+    """
+    if layer is Layer.DIFFICULTY:
+        at = np.linspace(0, 1, 256)
+        tones = zip(EASY, MIDDLE, LIMIT, strict=True)
+        hues = np.stack([np.interp(at, (0.0, 0.5, 1.0), tone) for tone in tones], axis=1)
+        hues[-1] = BLOCKED
+        return np.asarray(np.rint(hues), np.uint8)
     anchors = INFERNO if layer is Layer.TEMPERATURE else VIRIDIS
     known = np.frombuffer(bytes.fromhex(anchors), np.uint8).reshape(-1, 3)
     first = DARKEST if layer is Layer.TEMPERATURE else 0.0

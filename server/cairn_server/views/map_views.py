@@ -12,19 +12,21 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 
-from cairn_map.arrays import Ints
+from cairn_map.arrays import Flags, Ints
 from cairn_map.commits.cursor import Cursor
 from cairn_map.epochs.moment import time_from_text
 from cairn_map.errors import BadInputError, DamagedDataError, UnreachableError
 from cairn_map.evidence.brick_cell import brick_cell, reading_cell
-from cairn_map.evidence.grid import CellKey, cell_of_key, check_cubes
+from cairn_map.evidence.evidence import Evidence
+from cairn_map.evidence.grid import CellKey, cell_of_key
 from cairn_map.render.camera_rays import cells_in_sight
+from cairn_map.render.ground_picture import GroundCell, GroundColumns, check_layer, ground_cell, ground_of
 from cairn_map.render.map_picture import Ages, arrays_of, layer_picture, layer_values, npz_of
-from cairn_map.render.map_render import MapRenderer
+from cairn_map.render.map_render import MapRenderer, SurfaceImage
 from cairn_map.render.partial_map import Drawing, ReadCell, draw_as_needed, read_cell
 from cairn_map.render.render_picture import Layer, png_of
 from cairn_map.render.render_request import RenderRequest
@@ -52,8 +54,10 @@ RENDERS_AT_ONCE = 2
 WAIT_S = 5.0
 """Longest wait for another picture to be made."""
 THREADS = 2
-CELLS_BYTES = 256 << 20
+CELLS_BYTES = 224 << 20
 """Memory for cells of all maps that are ready to be drawn."""
+GROUND_BYTES = 32 << 20
+"""Memory for those of level layers."""
 LISTS_BYTES = 64 << 20
 """Memory for lists of cells."""
 LISTED_BYTES = 500
@@ -61,6 +65,8 @@ TIMES_MAX = 100_000
 Listing = tuple[dict[CellKey, CellRow], Ints]
 CellName = tuple[State, Layer, str | None]
 """State of a cell, layer in which it is drawn, and time at which it is read; None: now."""
+GroundName = tuple[State, str | None]
+"""State of a level's cell, and time at which it is read."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,8 +100,25 @@ class _Task:
 
     def name_of(self, key: CellKey) -> CellName:
         """Key of a cell that is ready for this picture, among those of all pictures."""
+        state, moment = self.ground_name_of(key)
+        return state, self.layer, moment
+
+    def ground_name_of(self, key: CellKey) -> GroundName:
+        """Key of a level's cell among those of all pictures, whatever layer they are drawn in."""
         moment = None if self.until_s is None else moment_name(self.row, self.until_s)
-        return state_of(self.snapshot, self.listed[key]), self.layer, moment
+        return state_of(self.snapshot, self.listed[key]), moment
+
+    def count_voxels(self, wanted: Sequence[CellKey]) -> None:
+        """Count the voxels of cells that are about to be read.
+
+        Raises:
+            BadInputError: kind `too_large`.
+        """
+        self.voxels += sum(self.listed[key].voxels for key in wanted)
+        if self.voxels > VOXELS_READ_MAX:
+            raise BadInputError(
+                "too_large", f"more than {VOXELS_READ_MAX} voxels are in the cells in sight; lower range_m"
+            )
 
     def check_time(self) -> None:
         """End what takes too long, or is not wanted any more.
@@ -122,6 +145,9 @@ class MapViews:
         self._read_cells: MadeOnce[CellName, ReadCell] = MadeOnce(
             limit_bytes=int(cache_share * CELLS_BYTES), size_of=lambda read: read.size_bytes
         )
+        self._ground_cells: MadeOnce[GroundName, GroundCell] = MadeOnce(
+            limit_bytes=int(cache_share * GROUND_BYTES), size_of=lambda read: read.size_bytes
+        )
         self._lists: MadeOnce[Cursor, Listing] = MadeOnce(
             limit_bytes=int(cache_share * LISTS_BYTES), size_of=lambda listing: LISTED_BYTES * (1 + len(listing[0]))
         )
@@ -132,12 +158,12 @@ class MapViews:
         """A picture of the map as it is now, or None for its bytes if the asker `known`s them by `If-None-Match`.
 
         Raises:
-            BadInputError: kind `unknown_channel`: the map has no such layer; `too_large`: too many cells or voxels are
-                in sight; `too_costly`: it takes too long; `level_layer`.
+            BadInputError: kinds `unknown_channel`, `not_level`: the map has no such layer; `too_large`: too many cells
+                or voxels are in sight; `too_costly`: it takes too long.
             UnreachableError: kind `busy`: others are being made.
             DamagedCellError: kind `damaged_store`: a cell in sight is damaged.
         """
-        check_cubes(row.geometry)
+        check_layer(row.geometry, request.layer)
         _get_ready()
         until_s = None if request.at is None else time_from_text(request.at)
         with self._cells.reading(row) as faults, self._store.snapshot(row) as snapshot:
@@ -149,7 +175,8 @@ class MapViews:
                 listed, places = self._listing(snapshot)
                 layer, cancellation = _read_of(request.layer), CANCELLATION.get()
                 task = _Task(snapshot, row, until_s, layer, listed, end_s, cancellation, faults.healed)
-                return AskedView(etag, snapshot.head, self._body(task, places, request))
+                draw = self._ground_body if row.geometry.is_flat else self._body
+                return AskedView(etag, snapshot.head, draw(task, places, request))
 
     @contextmanager
     def _turn(self) -> Iterator[None]:
@@ -165,21 +192,54 @@ class MapViews:
         snapshot, seen = drawing.snapshot, drawing.seen
         ages = None
         if request.layer is Layer.AGE:
-            ages = self._ages(task, drawing) if task.until_s is None else _past_ages(task, drawing, task.until_s)
+            ages = self._ages(task, _cells_seen(drawing.snapshot.frozen.keys, seen))
         values = layer_values(renderer, snapshot, seen, request.layer, ages)
         task.check_time()
         if request.format == "npz":
             return npz_of(arrays_of(values, seen, request.layer, request.spread))
         return png_of(layer_picture(values, seen, request.scale, request.spread))
 
-    def _drawing(self, task: _Task, places: Ints, request: RenderRequest) -> tuple[Drawing, MapRenderer]:
-        geometry, model, sight, T = task.row.geometry, task.row.sensor_model, request.sight, request.T_map_camera
-        edge_m = geometry.cell_edge_m
-        inside = cells_in_sight(places, sight, T, edge_m=edge_m, range_max_m=request.range_m)
+    def _ground_body(self, task: _Task, places: Ints, request: RenderRequest) -> bytes:
+        """A picture of a level layer."""
+        ground = self._ground(task, places, request)
+        image = ground.seen(request.sight, request.T_map_camera, range_max_m=request.range_m, on_share=task.check_time)
+        seen, ages = image.seen, None
+        if request.layer is Layer.AGE:
+            ages = self._ages(task, _cells_seen(ground.keys, seen))
+        values = image.values(request.layer, ages)
+        task.check_time()
+        if request.format == "npz":
+            return npz_of(arrays_of(values, seen, request.layer, request.spread))
+        return png_of(layer_picture(values, seen, request.scale, request.spread, shade=image.shade))
+
+    def _ground(self, task: _Task, places: Ints, request: RenderRequest) -> GroundColumns:
+        """The cells in sight, and those around them: what a surface is, its neighbours say."""
+        inside = self._inside(task, places, request)
+        # Of each cell in sight the 27 around it.
+        turns = np.stack(np.meshgrid(*3 * [[-1, 0, 1]], indexing="ij"), axis=-1).reshape(-1, 3)
+        wanted = {tuple(place) for turn in turns for place in (places[inside] + turn).tolist()}
+        keys = [key for key, place in zip(task.listed, places.tolist(), strict=True) if tuple(place) in wanted]
+        found: dict[CellKey, GroundCell] = {}
+        for key in keys:
+            task.check_time()
+            found[key] = self._ground_cells.get(task.ground_name_of(key), partial(_surfaces, task, key))
+        return ground_of(found, task.row.geometry)
+
+    def _inside(self, task: _Task, places: Ints, request: RenderRequest) -> Flags:
+        """(C,) True for the cells that may be in sight."""
+        edges_m = task.row.geometry.cell_edges_m
+        inside = cells_in_sight(
+            places, request.sight, request.T_map_camera, edges_m=edges_m, range_max_m=request.range_m
+        )
         if inside.sum() > CELLS_IN_VIEW_MAX:
             raise BadInputError(
                 "too_large", f"{inside.sum()} cells are in sight, {CELLS_IN_VIEW_MAX} at most may be; lower range_m"
             )
+        return inside
+
+    def _drawing(self, task: _Task, places: Ints, request: RenderRequest) -> tuple[Drawing, MapRenderer]:
+        geometry, model, sight, T = task.row.geometry, task.row.sensor_model, request.sight, request.T_map_camera
+        inside = self._inside(task, places, request)
         keys = [key for key, is_inside in zip(task.listed, inside, strict=True) if is_inside]
         kept = {key: self._read_cells.here(task.name_of(key)) for key in keys}
         here = {key: read for key, read in kept.items() if read is not None}
@@ -209,11 +269,7 @@ class MapViews:
     def _read(self, task: _Task, wanted: Sequence[CellKey]) -> dict[CellKey, ReadCell]:
         """Cells from the store, decoded side by side."""
         task.check_time()
-        task.voxels += sum(task.listed[key].voxels for key in wanted)
-        if task.voxels > VOXELS_READ_MAX:
-            raise BadInputError(
-                "too_large", f"more than {VOXELS_READ_MAX} voxels are in the cells in sight; lower range_m"
-            )
+        task.count_voxels(wanted)
         stored = {key: row_of_cell(task.snapshot, key) for key in wanted}
 
         def make(key: CellKey) -> ReadCell:
@@ -230,13 +286,15 @@ class MapViews:
                 found[key] = _ready(sound, task)
         return found
 
-    def _ages(self, task: _Task, drawing: Drawing) -> Ages:
+    def _ages(self, task: _Task, keys: Sequence[CellKey]) -> Ages:
         """Times (UTC seconds) of the last measurement of everything seen; now is the newest one of what is in the map.
 
         So the picture depends on the map alone. Where a commit states no time, or one was taken out since, the age is
         unknown.
         """
-        stamps = {key: self._stamps(task, key) for key in _cells_seen(drawing)}
+        if task.until_s is not None:
+            return _past_ages(task, keys, task.until_s)
+        stamps = {key: self._stamps(task, key) for key in keys}
         entries = {int(seq) for each in stamps.values() for seq in np.unique(each)} - {0}
         newest_s = task.snapshot.newest_captured_s()
         times = {seq: self._time_of(task, seq) for seq in sorted(entries)}
@@ -298,16 +356,15 @@ def _read_of(layer: Layer) -> Layer:
     return Layer.DEPTH if layer is Layer.AGE else layer
 
 
-def _cells_seen(drawing: Drawing) -> list[CellKey]:
-    """Cells of which a pixel shows something."""
-    slots = np.unique(drawing.seen.slots[drawing.seen.hit]).tolist()
-    return [drawing.snapshot.frozen.keys[slot] for slot in slots]
+def _cells_seen(keys: Sequence[CellKey], seen: SurfaceImage) -> list[CellKey]:
+    """Cells of which a pixel shows something; `keys`: by slot."""
+    return [keys[slot] for slot in np.unique(seen.slots[seen.hit]).tolist()]
 
 
-def _past_ages(task: _Task, drawing: Drawing, until_s: float) -> Ages:
+def _past_ages(task: _Task, keys: Sequence[CellKey], until_s: float) -> Ages:
     """Times of the last measurement, until a time, of everything seen; now is that time."""
     changes = {}
-    for key in _cells_seen(drawing):
+    for key in keys:
         task.check_time()
         stored = sound_cell(task.snapshot, key, task.row.layer, task.healed)
         if stored is None:
@@ -319,17 +376,33 @@ def _past_ages(task: _Task, drawing: Drawing, until_s: float) -> Ages:
 
 def _ready(stored: CellRow | None, task: _Task) -> ReadCell:
     """A stored cell, checked and ready to be drawn."""
-    if stored is None:
-        raise DamagedDataError("damaged_store", "a cell is listed, but is not there")
     geometry, model = task.row.geometry, task.row.sensor_model
-    with DECODING.of_cell(geometry, stored.voxels):
-        if task.until_s is None:
-            evidence = stored_reading(stored, task.row)
-        else:
-            evidence = past_reading(task.snapshot, stored, task.row, task.until_s)
+    with DECODING.of_cell(geometry, 0 if stored is None else stored.voxels):
+        evidence = _evidence(stored, task)
         is_sum = evidence.odds is None
         cell = brick_cell(geometry, [evidence]) if is_sum else reading_cell(geometry, evidence, model)
         return read_cell(cell, geometry, model, task.layer)
+
+
+def _surfaces(task: _Task, key: CellKey) -> GroundCell:
+    """Surfaces and obstacles of a level's stored cell."""
+    task.count_voxels([key])
+    stored = sound_cell(task.snapshot, key, task.row.layer, task.healed)
+    with DECODING.of_cell(task.row.geometry, task.listed[key].voxels):
+        return ground_cell(_evidence(stored, task), key, task.row.geometry, task.row.sensor_model)
+
+
+def _evidence(stored: CellRow | None, task: _Task) -> Evidence:
+    """A stored cell as it reads at the picture's time.
+
+    Raises:
+        DamagedDataError: kind `damaged_store`.
+    """
+    if stored is None:
+        raise DamagedDataError("damaged_store", "a cell is listed, but is not there")
+    if task.until_s is None:
+        return stored_reading(stored, task.row)
+    return past_reading(task.snapshot, stored, task.row, task.until_s)
 
 
 def _etag(head: Cursor, request: RenderRequest) -> str:

@@ -321,7 +321,16 @@ def test_a_level_is_added_mapped_into_and_read_as_the_ground(server: LiveServer,
     assert "level_layer" in cairn("map", "query", url, "ray", "0,0,1", "1,0,0", folder=tmp_path, code=1)
     assert "level_layer" in cairn("map", "export", url, "--ot", str(tmp_path / "g.ot"), folder=tmp_path, code=1)
     render = ("map", "render", url, "-o", str(tmp_path / "r.png"), "--from=0,0,2", "--to=1,0,0")
-    assert "level_layer" in cairn(*render, folder=tmp_path, code=1)
+    assert "unknown_channel" in cairn(*render, folder=tmp_path, code=1)
+    cairn(*render, "--layer", "difficulty", "--npz", str(tmp_path / "r.npz"), folder=tmp_path)
+    cairn("map", "export", url, "--cells", str(tmp_path / "cells"), folder=tmp_path)
+    at_home = ("map", "render", str(tmp_path / "cells"), *render[3:], "--layer", "difficulty")
+    served = (tmp_path / "r.png").read_bytes()
+    assert "of them on the map" in cairn(*at_home, folder=tmp_path)
+    assert (tmp_path / "r.png").read_bytes() == served
+    with np.load(tmp_path / "r.npz") as arrays:
+        assert np.nanmax(arrays["difficulty"]) > 1  # the obstacle
+    assert "not_level" in cairn("map", "render", server.map_url, *render[3:], "--layer=slope", folder=tmp_path, code=1)
 
 
 def test_a_level_that_cannot_be_is_refused(server: LiveServer, tmp_path: Path) -> None:

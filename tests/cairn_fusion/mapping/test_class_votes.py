@@ -15,9 +15,9 @@ from cairn_fusion.mapping.integrate import Integrator, integrate_scan, integrate
 from cairn_fusion.mapping.integrate import Method as IntegrationMethod
 from cairn_fusion.recording.scan import Scan
 from cairn_map.errors import BadInputError
-from cairn_map.evidence.channels import classes_channel
-from cairn_map.evidence.evidence import every_sum_has_weight
-from cairn_map.evidence.grid import Geometry, split_voxels, voxels_of_points
+from cairn_map.evidence.channels import Channel, ChannelKind, classes_channel
+from cairn_map.evidence.evidence import every_sum_has_weight, packed_evidence
+from cairn_map.evidence.grid import CellKey, Geometry, cell_key, split_voxels, voxels_of_points
 
 GEOMETRY = Geometry(voxel_edge_um=100_000, depth=4, channels=(classes_channel(("wall", "floor", "chair")),))
 PLAIN = GEOMETRY.model_copy(update={"channels": ()})
@@ -69,16 +69,13 @@ def test_votes_are_those_of_the_slow_twin(seeds: list[int]) -> None:
     assert all(every_sum_has_weight(cell.samples, GEOMETRY) for cell in diff.values())
 
 
-def test_hits_and_misses_are_those_of_a_map_without_classes_in_any_order_of_scans(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_hits_and_misses_are_those_of_a_map_without_classes_in_any_order_of_scans() -> None:
     scans = [labelled(seed) for seed in range(4)]
     diff = integrate_scans(scans, RIG, GEOMETRY, integrator=Integrator())
     plain = integrate_scans(scans, RIG, PLAIN, integrator=Integrator())
     assert {key: cell.counts.tolist() for key, cell in diff.items()} == {
         key: cell.counts.tolist() for key, cell in plain.items()
     }
-    monkeypatch.setattr(class_votes, "ROWS_MAX", 10)  # pixels of many scans are added up on the way
     assert integrate_scans(scans[::-1], RIG, GEOMETRY, integrator=Integrator(), threads=1) == diff
 
 
@@ -100,13 +97,48 @@ def test_votes_for_many_classes_take_little_more_memory_than_their_evidence() ->
     voxels = np.stack(np.unravel_index(np.arange(16**4), (64, 32, 32)), axis=1).astype(np.int64)
     votes, rng = class_votes.ClassVotes(many), np.random.default_rng(1)
     for camera in "abcde":
-        votes._count(camera, voxels, np.arange(len(voxels)), rng.integers(0, 64, len(voxels)))
+        votes.count(camera, voxels, rng.integers(0, 64, len(voxels)))
     tracemalloc.start()
-    diff = votes.diff()
+    diff = votes.joined({})
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert sum(int(cell.samples[:, -1].sum()) for cell in diff.values()) == 5 * len(voxels)
     assert peak < 2 * sum(cell.size_bytes for cell in diff.values())
+
+
+@pytest.mark.parametrize("reach", [2, 50, 1 << 27])
+def test_pixels_are_counted_whatever_the_voxels_and_in_whatever_parts_they_come(reach: int) -> None:
+    rng = np.random.default_rng(reach)
+    voxels, classes = rng.integers(-reach, reach, (400, 3)), rng.integers(-1, 64, 400)
+    counts = class_votes.PixelCounts()
+    for part in np.split(np.arange(400), [0, 1, 3, 50, 390]):
+        counts.add(voxels[part], classes[part])
+    pixels: dict[tuple[int, ...], Counter[int]] = {}
+    for voxel, number in zip(voxels.tolist(), classes.tolist(), strict=True):
+        if number >= 0:
+            pixels.setdefault(tuple(voxel), Counter())[number] += 1
+    found, winners, _ = counts.votes()
+    assert dict(zip(map(tuple, found.tolist()), winners.tolist(), strict=True)) == {
+        voxel: min(each, key=lambda number: (-each[number], number)) for voxel, each in pixels.items()
+    }
+    assert counts.pixels[: counts.pairs].sum() == np.count_nonzero(classes >= 0)
+
+
+def test_votes_where_nothing_was_hit_and_readings_of_other_channels_are_kept() -> None:
+    dose = Channel(kind=ChannelKind.SCALAR, name="dose", unit="uSv/h", step=0.1, zero=0.0)
+    both = GEOMETRY.model_copy(update={"channels": (dose, *GEOMETRY.channels)})
+    counted = packed_evidence(
+        np.array([3, 9], np.uint32),
+        np.array([[1, 0], [0, 1]]),
+        np.array([[0, 0], [7, 1]]),
+        class_votes.without_classes(both),
+    )
+    votes = class_votes.ClassVotes(both)
+    votes.count("tof", np.array([[1, 1, 0], [0, 1, 1]]), np.array([2, 3]))  # places 3 and 6, one of them never hit
+    joined = votes.joined({CellKey(cell_key((0, 0, 0))): counted})[cell_key((0, 0, 0))]
+    assert joined.voxels.tolist() == [3, 6, 9] and joined.counts.tolist() == [[1, 0], [0, 0], [0, 1]]
+    assert joined.sampled.tolist() == [0, 1, 2]
+    assert joined.samples.tolist() == [[0, 0, 0, 0, 1, 1], [0, 0, 0, 0, 0, 1], [7, 1, 0, 0, 0, 0]]
 
 
 def test_labels_of_a_map_without_classes_are_left_aside() -> None:

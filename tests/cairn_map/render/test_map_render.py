@@ -251,7 +251,7 @@ def test_cells_beside_the_view_are_not_in_sight() -> None:
     cells = rng.integers(-8, 8, (400, 3))
     for _ in range(20):
         T = random_pose(rng, 3.0)
-        inside = cells_in_sight(cells, SIGHT, T, edge_m=0.4, range_max_m=2.5)
+        inside = cells_in_sight(cells, SIGHT, T, edges_m=(0.4, 0.4, 0.4), range_max_m=2.5)
         points = (cells + rng.random((400, 3))) * 0.4
         in_camera = (points - T[:3, 3]) @ T[:3, :3]
         pixels = in_camera[:, :2] / in_camera[:, 2:] * 16 + [9.5, 6.5]

@@ -11,7 +11,7 @@ import httpx
 import numpy as np
 import numpy.typing as npt
 import pytest
-from tests.fixtures.map.made import PLAIN, SMALL
+from tests.fixtures.map.made import PLAIN, SMALL, surface_evidence
 from tests.fixtures.server.answers import kind_of
 from tests.fixtures.server.damage import broken_map, damage
 from tests.fixtures.server.live import Live
@@ -19,18 +19,22 @@ from tests.fixtures.server.pushes import pushed
 
 from cairn_map.codec.cell_code import decode_cell
 from cairn_map.evidence.evidence_map import EvidenceMap
-from cairn_map.evidence.grid import CellKey
+from cairn_map.evidence.grid import CellKey, cell_key, cell_of_key, level_geometry
 from cairn_map.queries.map_snapshot import snapshot_of
+from cairn_map.render.ground_picture import whole_ground
 from cairn_map.render.legend import with_legend
 from cairn_map.render.map_picture import layer_picture, layer_values
 from cairn_map.render.map_render import MapRenderer
-from cairn_map.render.render_picture import Layer, Scale
+from cairn_map.render.render_picture import GROUND_LAYERS, Layer, Scale, png_of
 from cairn_map.render.render_request import RenderRequest, request_from
 from cairn_map.warm_up import warm_up_pictures
 from cairn_server.store.store_rows import MapRow
 from cairn_server.views import map_views
 
 LOOK = request_from((1.4, 1.3, 1.2), (0.1, 0.2, 0.3), width=64, height=48, focal_px=40.0, range_m=6.0)
+GROUND_CELL = cell_key((-1, 0, 0))
+LAYERS = [layer for layer in Layer if layer not in GROUND_LAYERS]
+"""Those of cubes."""
 
 
 def mapped(live: Live, *numbers: int) -> MapRow:
@@ -64,7 +68,7 @@ def arrays(answer: httpx.Response) -> dict[str, npt.NDArray[Any]]:
         return dict(found)
 
 
-@pytest.mark.parametrize("layer", [layer for layer in Layer if layer is not Layer.AGE])
+@pytest.mark.parametrize("layer", [layer for layer in LAYERS if layer is not Layer.AGE])
 def test_a_picture_is_what_the_same_map_shows_at_home(live: Live, layer: Layer) -> None:
     row, request = mapped(live, 0, 1), asking(layer=layer)
     answer = ask(live, row, request)
@@ -94,18 +98,18 @@ def test_cells_that_were_drawn_are_not_read_again_and_weigh_what_their_layer_doe
     live: Live, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     row, views = mapped(live, 0, 1), live.service.views.pictures
-    first = {layer: ask(live, row, asking(layer=layer)).content for layer in Layer}
+    first = {layer: ask(live, row, asking(layer=layer)).content for layer in LAYERS}
     with live.service.store.snapshot(row) as snapshot:
         chains = {snapshot.chain_at(cell.lm) for cell in snapshot.cells()}
     kept = {name: read for name, (read, _) in views._read_cells._kept.items() if name[0][0] in chains}
-    assert {layer for _, layer, _ in kept} == set(Layer) - {Layer.AGE}
+    assert {layer for _, layer, _ in kept} == {*LAYERS} - {Layer.AGE}
     for (_, layer, _), read in kept.items():
         arrays = (read.cell.counts.brick_of, read.states.bricks, read.states.words, *read.tables.tables.values())
         assert read.size_bytes == sum(array.nbytes for array in arrays)
         assert len(read.tables.tables) == (layer is not Layer.DEPTH)
         assert read.cell.counts.pool.strides == (0, 0, 0) and not len(read.cell.samples.packed()[0])
     monkeypatch.setattr(map_views, "_ready", None)  # who reads one now fails
-    assert {layer: ask(live, row, asking(layer=layer)).content for layer in Layer} == first
+    assert {layer: ask(live, row, asking(layer=layer)).content for layer in LAYERS} == first
 
 
 def test_the_etag_is_of_the_map_and_of_the_question(live: Live) -> None:
@@ -292,3 +296,29 @@ def test_a_damaged_cell_is_no_empty_place(live: Live) -> None:
 def test_an_empty_map_is_drawn_as_nothing(live: Live) -> None:
     told = arrays(ask(live, live.new_map(SMALL), asking(format="npz")))
     assert np.isnan(told["range_m"]).all()
+
+
+def test_a_level_is_drawn_as_at_home_and_its_cells_are_kept(live: Live, monkeypatch: pytest.MonkeyPatch) -> None:
+    level = level_geometry().model_copy(update={"depth": 4})
+    row = live.new_map(level)
+    commit = pushed(0, 0, geometry=level, cells={GROUND_CELL: surface_evidence(1, level)}, scans=40)
+    assert live.push(row, commit).status_code == 201
+    live.folded(row)
+    i, j, k = (edge * (place + 0.5) for edge, place in zip(level.cell_edges_m, cell_of_key(GROUND_CELL), strict=True))
+    look = request_from((i - 2, j - 2, k + 3), (i, j, k), width=64, height=48, focal_px=40.0, range_m=20.0)
+    for layer in (Layer.DIFFICULTY, Layer.HEIGHT, Layer.PROBABILITY, Layer.DEPTH):
+        request = asking(look, layer=layer, low=0.0, high=4.0)
+        image = whole_ground(snapshot_of(map_of(live, row), row.sensor_model)).seen(
+            look.sight, look.T_map_camera, range_max_m=20.0
+        )
+        assert image.seen.hit.mean() > 0.05
+        picture = layer_picture(image.values(layer), image.seen, request.scale, shade=image.shade)
+        assert ask(live, row, request).content == png_of(picture)
+        monkeypatch.setattr(map_views, "ground_cell", None)  # who reads one now fails
+    ages = arrays(ask(live, row, asking(look, layer=Layer.AGE, format="npz")))["age_s"]
+    assert (ages[image.seen.hit] == 0).all()
+    for layer, kind in ((Layer.COLOUR, "unknown_channel"), (Layer.TEMPERATURE, "unknown_channel")):
+        assert kind_of(ask(live, row, asking(look, layer=layer))) == kind
+    assert kind_of(ask(live, mapped(live, 0), asking(layer=Layer.SLOPE))) == "not_level"
+    monkeypatch.setattr(map_views, "CELLS_IN_VIEW_MAX", 0)
+    assert kind_of(ask(live, row, asking(look, layer=Layer.STEP))) == "too_large"

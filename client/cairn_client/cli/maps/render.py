@@ -3,14 +3,16 @@
     $ cairn map render lab/ --from 1,2,1.4 --to 4,2.5,1 -o view.png
     view.png: temperature, 640 x 480 pixels, 91% of them on the map, 0.3 to 11.2 m away
     $ cairn map render http://127.0.0.1:8750/maps/lab --from 1,2,1.4 --to 4,2.5,1 --layer colour -o view.png
+    $ cairn map render http://127.0.0.1:8750/maps/lab.ground --from -4,-6,7 --to 14,10,0 --layer slope -o ground.png
     $ cairn map render lab/ --from 1,2,1.4 --to 4,2.5,1 --at 14:05 -o then.png       # as it was, in a map with epochs
     $ cairn map render lab/ --over recordings/run1 --scan 12 --camera colour_left -o overlay.png
     overlay.png: temperature over colour_left, scan 12: visible 71%, see-through 22%, map only 3%
 
 A map is the URL of one on a server, the folder that `cairn map export --cells` wrote, or the state folder of a robot
 that is not running. Layers: temperature, colour, probability, depth, and age, in seconds before the newest measurement:
-a server knows it of everything, a robot's state of commits of its own that it still keeps. The scale is fixed (--low,
---high), so that pictures can be compared; surfaces without a value are grey, and unmapped space is dark.
+a server knows it of everything, a robot's state of commits of its own that it still keeps; of a level layer height,
+slope, step and difficulty, for a usual vehicle. The scale is fixed (--low, --high), so that pictures can be compared;
+surfaces without a value are grey, and unmapped space is dark.
 
 Over a recorded image the map is compared with the depth that the robot measured there and then. Parts that agree are
 painted solid; parts behind the surface that the camera sees, beyond the next free space, in stripes, fainter the
@@ -35,6 +37,7 @@ from cairn_client.cli.robot_arguments import add_spread_arguments, place, spread
 from cairn_client.cli.source_arguments import add_source_arguments, asked_source
 from cairn_client.folders.map_folder import FolderMap, map_of_folder
 from cairn_map.errors import BadInputError
+from cairn_map.render.ground_picture import check_layer, whole_ground
 from cairn_map.render.map_picture import arrays_of, layer_picture, layer_values, npz_of
 from cairn_map.render.map_render import MapRenderer
 from cairn_map.render.render_picture import SCALES, Layer, Scale, png_of
@@ -140,11 +143,17 @@ def _draw_over(args: argparse.Namespace, found: FolderMap) -> None:
 
 
 def _look(args: argparse.Namespace, request: RenderRequest, found: FolderMap) -> None:
-    snapshot, renderer, scale = found.snapshot, MapRenderer(threads=THREADS), request.scale
-    seen = renderer.nearest(snapshot, request.sight, request.T_map_camera, range_max_m=request.range_m)
-    values = layer_values(renderer, snapshot, seen, request.layer, found.ages)
-    spread = request.spread
-    picture = layer_picture(values, seen, scale, spread)
+    snapshot, scale, spread = found.snapshot, request.scale, request.spread
+    if snapshot.geometry.is_flat:
+        check_layer(snapshot.geometry, request.layer)
+        image = whole_ground(snapshot).seen(request.sight, request.T_map_camera, range_max_m=request.range_m)
+        seen, values = image.seen, image.values(request.layer, found.ages)
+        picture = layer_picture(values, seen, scale, spread, shade=image.shade)
+    else:
+        renderer = MapRenderer(threads=THREADS)
+        seen = renderer.nearest(snapshot, request.sight, request.T_map_camera, range_max_m=request.range_m)
+        values = layer_values(renderer, snapshot, seen, request.layer, found.ages)
+        picture = layer_picture(values, seen, scale, spread)
     _write(args, picture, arrays_of(values, seen, request.layer, spread))
     near, far = (float(f(seen.range_m[seen.hit])) if seen.hit.any() else np.nan for f in (np.min, np.max))
     say(

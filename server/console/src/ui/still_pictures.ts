@@ -4,8 +4,9 @@ import type { Api } from "../api.ts";
 import { fill, h, pictureOf } from "../dom.ts";
 import type { Branch, MapInfo, Pose } from "../messages.ts";
 
-const LAYERS = { colour: "Colour", temperature: "Temperature", probability: "Certainty", depth: "Distance", age: "Age" } as const;
-type Layer = keyof typeof LAYERS;
+const LAYERS = { colour: "Colour", temperature: "Temperature", probability: "Certainty", depth: "Distance", age: "Age" };
+/** Of a level, which has surfaces in the place of colours. */
+const OF_LEVEL = { height: "Height", slope: "Slope", step: "Step", difficulty: "Difficulty", probability: "Certainty", depth: "Distance", age: "Age" };
 const SIZE = { width: 640, height: 480, focal_px: 500 };
 /** Farthest that the server looks, m. */
 const RANGE_M = 50;
@@ -23,12 +24,15 @@ export class StillPictures {
   private readonly choice = h("div", { class: "buttons" });
   private viewpoints: readonly Viewpoint[] = [];
   private from = 0;
-  private layer: Layer = "colour";
+  private readonly layers: Readonly<Record<string, string>>;
+  private layer: string;
   private asked = 0;
 
   constructor(api: Api, info: MapInfo) {
     this.api = api;
     this.info = info;
+    this.layers = info.geometry.height_step_um === undefined ? LAYERS : OF_LEVEL;
+    this.layer = Object.keys(this.layers)[0]!;
     fill(
       this.element, h("h1", {}, "This browser cannot draw the map"),
       h("p", {}, "It has no WebGL 2: switch on hardware acceleration, or open this page in another browser. Until then the server draws pictures:"),
@@ -51,12 +55,14 @@ export class StillPictures {
       h("button", { type: "button", "aria-pressed": String(on), onclick: () => (run(), void this.show()) }, label);
     fill(
       this.choice, ...this.viewpoints.map(({ name }, n) => press(name, n === this.from, () => (this.from = n))),
-      ...Object.entries(LAYERS).map(([layer, label]) => press(label, layer === this.layer, () => (this.layer = layer as Layer))),
+      ...Object.entries(this.layers).map(([layer, label]) => press(label, layer === this.layer, () => (this.layer = layer))),
     );
     fill(this.picture, h("p", { role: "status" }, "The server draws ..."));
     const { name, pose } = this.viewpoints[this.from];
     const places = [...pose.t_map_rig, ...pose.q_map_rig].map((value) => value.toFixed(4));
     const query = new URLSearchParams(Object.entries({ ...SIZE, layer: this.layer, range_m: RANGE_M }).map(([key, value]) => [key, String(value)]));
+    // Heights have no scale that fits all sites: that of the map.
+    if (this.layer === "height" && this.info.box_m) ["low", "high"].forEach((key, n) => query.set(key, this.info.box_m![n]![2].toFixed(2)));
     ["x", "y", "z", "qx", "qy", "qz", "qw"].forEach((key, n) => query.set(key, places[n]));
     let found: HTMLElement;
     try {
