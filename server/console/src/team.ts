@@ -17,7 +17,8 @@ import { RobotMap } from "./ui/robot_map.ts";
 import { RobotPicture } from "./ui/robot_picture.ts";
 import { isOffline, TeamPanel } from "./ui/team_panel.ts";
 
-const REFRESH_MS = 10_000;
+/** Live events tell when robots push, fetch and report; what they left out is asked for now and then. */
+const REFRESH_MS = 60_000;
 const SOON_MS = 1000;
 const OFFLINE_COLOUR = "#8b949e";
 /** Where the eye is that follows a robot, m: so far behind it and over it, or nearer, this far before what is in the way. */

@@ -4,7 +4,7 @@ import type { Api } from "../api.ts";
 import { facts, fill, h } from "../dom.ts";
 import { robotOf } from "../log_book.ts";
 import type { LogEntry, Retracted, RetractRequest } from "../messages.ts";
-import type { TakenOut } from "../timeline.ts";
+import { whoTookOut, type TakenOut } from "../timeline.ts";
 import { bytes, clock, counted } from "../units.ts";
 
 const OPERATOR = "operator";
@@ -46,7 +46,7 @@ export function openCommit(api: Api, map: string, entry: LogEntry, { mayRetract,
       ["seen", entry.captured_s ? clock(last) : "unknown"],
       ["came", entry.pushed_s ? clock(entry.pushed_s) : "unknown"],
       ["size", `${bytes(entry.size_bytes)} in ${counted(entry.cells, "cell", "cells")}`],
-      ["came by", entry.via ?? (robot === OPERATOR ? "an operator" : "its robot")],
+      ["came by", entry.via ? `token ${entry.via}` : robot === OPERATOR ? "an operator" : "its robot"],
       ...(entry.note ? [["note", entry.note] as [string, string]] : []),
     ]),
     ...(isRetract ? [h("h3", {}, "It takes out"), listOf(entry.retracts)] : []),
@@ -116,10 +116,11 @@ export function openCommit(api: Api, map: string, entry: LogEntry, { mayRetract,
 }
 
 /** What an operator must know first: that it is out already, and why. */
-function outFacts({ whenS, by, note }: TakenOut): HTMLElement {
+function outFacts(out: TakenOut): HTMLElement {
+  const { whenS, by, note } = out;
   return h(
     "div", { class: "out" }, h("strong", {}, "Taken out of the map"),
-    facts([["when", whenS === null ? "unknown" : clock(whenS)], ["by", by === null ? "unknown" : h("span", {}, robotOf(by), " in ", h("code", {}, by))], ["why", note || "no note"]]),
+    facts([["when", whenS === null ? "unknown" : clock(whenS)], ["by", by === null ? "unknown" : h("span", {}, whoTookOut(out), " in ", h("code", {}, by))], ["why", note || "no note"]]),
   );
 }
 
