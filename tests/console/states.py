@@ -56,7 +56,7 @@ def _retracting(console: Console) -> None:
 
 def _compared(console: Console) -> None:
     console.tell("(c.time.compare(), 0)")
-    console.page.get_by_text("Comparing").wait_for(state="detached")
+    console.until("c.time.comparison.changes", "the server compared")
 
 
 def _keys(console: Console) -> None:

@@ -1,6 +1,6 @@
 /** Taking commits out again: what, then what that would name, then for good. */
 
-import type { Api } from "../api.ts";
+import { ApiError, type Api } from "../api.ts";
 import { facts, fill, h } from "../dom.ts";
 import { robotOf } from "../log_book.ts";
 import type { LogEntry, Retracted, RetractRequest } from "../messages.ts";
@@ -91,7 +91,7 @@ export function openCommit(api: Api, map: string, entry: LogEntry, { mayRetract,
     const changes = h("p", { role: "status" }, "Looking what it changes …");
     fill(said, h("p", {}, `${counted(found.commits.length, "commit", "commits")}:`), listOf(found.commits), changes);
     stepAside(dialog);
-    changes.textContent = await inMap({ commits: shown, preview: true }).catch((error: Error) => error.message);
+    changes.textContent = await inMap({ commits: shown, preview: true }).catch(uncoloured);
   });
   confirm.addEventListener("click", async () => {
     confirm.disabled = preview.disabled = true;
@@ -113,6 +113,12 @@ export function openCommit(api: Api, map: string, entry: LogEntry, { mayRetract,
   });
   document.body.append(dialog);
   dialog.showModal();
+}
+
+/** Why the map does not show what would change: of one commit alone there is no smaller question. */
+function uncoloured(error: Error): string {
+  if (error instanceof ApiError && error.kind === "too_large") return "It changes more voxels than the map can colour. Nothing is taken out yet.";
+  return error.message;
 }
 
 /** What an operator must know first: that it is out already, and why. */
