@@ -95,7 +95,7 @@ export class FindingsPanel {
       "button",
       { type: "button", class: "find", "data-find": id, "aria-pressed": String(isChosen), title: number < 10 ? `Fly there (${number})` : "Fly there", onclick: () => this.onFly(id) },
       h("b", { class: "no" }, String(number)), h("strong", {}, celsius === null ? title : `${celsius.toFixed(1)} °C`),
-      overM === null ? null : h("span", { class: "hint", title: "Height over the floor" }, `${overM.toFixed(1)} m up`), h("span", { class: "state", "data-state": state }, STATES[state]),
+      overM === null ? null : h("span", { class: "hint", title: "Height over the floor" }, `at ${overM.toFixed(1)} m`), h("span", { class: "state", "data-state": state }, STATES[state]),
     );
     if (!isChosen) return h("li", {}, button);
     const act = (what: Act, name: string) => h("button", { type: "button", "data-find": `${what} ${id}`, onclick: () => this.onAct(what, id) }, name);
