@@ -117,6 +117,8 @@ def test_a_flight_ends_where_the_thing_is_seen_with_the_ceiling_on_or_off(
             met = console.tell(MIDDLE)
             assert met is not None, name
             off_m = min(np.linalg.norm(np.subtract(met, centre_m(voxel))) for voxel in voxels)
+            if ceiling:
+                assert console.tell("c.look.ceilingM === null") == (name == "lamp"), "cut again behind the lamp"
             assert off_m <= 2 * GEOMETRY.voxel_edge_m * np.sqrt(3), (name, met)
             x, y, z = console.tell("c.stage.view.eye")
             width_m, height_m = (side * GEOMETRY.voxel_edge_m for side in (WIDE, HIGH))

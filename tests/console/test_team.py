@@ -169,6 +169,7 @@ def test_a_robot_is_drawn_where_it_is_and_looks_and_grey_when_it_is_gone(console
     row = row_of(console, MOLE.robot)
     row.get_by_text("online").wait_for()
     console.page.route(f"**/maps/{CREW}/**", later)
+    console.tell("c.team.refresh()")
     row.get_by_text("offline").wait_for()
     row.get_by_text("seen 1 min ago").wait_for()
     console.page.locator(".label.offline", has_text="mole").wait_for()

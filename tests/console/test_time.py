@@ -271,13 +271,14 @@ def test_what_changed_is_listed_coloured_and_flown_to(console: Console) -> None:
 def test_a_commit_that_was_taken_out_says_when_by_whom_and_why_and_offers_no_second_retract(console: Console) -> None:
     page = console.page
     mark = page.get_by_role("button", name=f"commit {OUT.commit.id}")
-    assert re.search(rf"taken out 20\d\d-.* by .*: {NOTE}", mark.get_attribute("aria-label") or "")
+    assert re.search(rf"taken out 20\d\d-.* by admin \(operator\): {NOTE}", mark.get_attribute("aria-label") or "")
     mark.focus()
     page.keyboard.press("Enter")
     dialog = page.get_by_role("dialog")
     told = dialog.inner_text()
     assert "Taken out of the map" in told
     assert NOTE in told
+    assert "admin (operator) in operator." in told
     assert dialog.get_by_role("button").all_inner_texts() == ["Close"]
     page.keyboard.press("Escape")
     page.get_by_role("button", name="retract operator.").click()

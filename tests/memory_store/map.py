@@ -136,7 +136,7 @@ class MemoryMap:
         if known is not None:
             return self._append_again(known, commit, age_s)
         self._check_kept(commit.retracts)
-        intervals = self._checked_intervals(commit.id, is_carried=commit.via is not None)
+        intervals = self._checked_intervals(commit.id, is_carried=commit.is_carried)
         self._check_sums(commit)
         admit_commit(keys, commit.id.author, commit.grounds)
         top, _ = self.authors.get(commit.id.author, (0, 0))

@@ -390,7 +390,10 @@ class LogEntry(_Model):
     place_m: tuple[float, float, float] | None = None
     """Place of the rig at the commit's last scan, metres, map frame; None: it has no scans, or is not kept any more."""
     via: str | None = None
-    """Name of the token of the relay that handed it over; None: its own robot did, or the server made it."""
+    """Name of the token of the relay that handed it over, or of the operator for whom the server made it.
+
+    None: its own robot pushed it.
+    """
     note: Annotated[str, Field(max_length=1024)] = ""
     """Note of its author; empty, too, once its evidence is not kept."""
     pushed_s: Annotated[float | None, Field(exclude_if=lambda value: value is None)] = None

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 from cairn_map.commits.cursor import Cursor
-from cairn_map.commits.ids import Author, CommitId
+from cairn_map.commits.ids import OPERATOR, Author, CommitId
 from cairn_map.commits.mark import Mark, MarkKey
 from cairn_map.commits.version_vector import VersionVector
 from cairn_map.epochs.epoch import BASE, Epoch
@@ -74,7 +74,7 @@ class NewCommit:
     signatures: str | None = None
     """Checked signatures of the authors in whose names it speaks, as in `Cairn-Signature`."""
     via: str | None = None
-    """Name of the token of the relay that handed it over."""
+    """Name of the token of the relay that handed it over, or of the operator for whom the server made it."""
     grounds: Grounds = OWN_WORD
     """Grounds on which it speaks for its author."""
     epoch: Epoch = BASE
@@ -83,6 +83,11 @@ class NewCommit:
     """Its marks, by number; then it has no evidence."""
     layer: LayerDefinition | None = None
     """Layer of the map that begins with it; then it has no evidence."""
+
+    @property
+    def is_carried(self) -> bool:
+        """True if a relay brings it, whose robots have fewer places than those that come themselves."""
+        return self.via is not None and self.id.author.robot != OPERATOR
 
 
 Millimetres = tuple[int, int, int]

@@ -67,7 +67,7 @@ class MapLayers:
             check_same_layer(name, found.layer, request.definition)
             return LayerAdded(commit=None, layer=layer_info(self._info(found)))
         check_geometry(request.geometry, self._shares)
-        commit = self._commits.append(row, layer=request.definition)
+        commit = self._commits.append(row, by=by.name, layer=request.definition)
         self._store.audit_log.add(
             by.name, "add_layer", f"map {row.name}: {request.definition} by {commit}", client=by.address
         )

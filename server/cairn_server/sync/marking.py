@@ -84,7 +84,7 @@ class Marking:
             others = [mark.model_copy(update={"by": mark.by or key.commit.author.robot}) for mark in kept]
             others[key.number : key.number + 1] = [new] if new else []
             marks, targets, place = tuple(others), (key.commit,), key.number
-        commit = self._commits.append(row, retracts=targets, marks=marks)
+        commit = self._commits.append(row, by=by.name, retracts=targets, marks=marks)
         receipt = MarkReceipt(commit=str(commit), key=str(MarkKey(commit, place)) if new else None)
         what = f"{receipt.key or 'nothing'} in the place of {request.of}" if request.of else f"{receipt.key}"
         self._store.audit_log.add(by.name, "mark", f"map {row.name}: {what}", client=by.address)

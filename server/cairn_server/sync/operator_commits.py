@@ -27,6 +27,7 @@ class OperatorCommits:
         self,
         row: MapRow,
         *,
+        by: str,
         retracts: tuple[CommitId, ...] = (),
         note: str = "",
         marks: tuple[Mark, ...] = (),
@@ -34,12 +35,14 @@ class OperatorCommits:
     ) -> CommitId:
         """Keep a commit that takes others out, or brings marks, or both, or defines a layer; durable on return.
 
+        The log names the token that asked for it, `by`.
+
         Raises:
             ConflictError: kind `evidence_gone`, `other_layer` or `too_many_layers`.
             BadInputError: kind `too_many_marks`.
         """
         author = Author(OPERATOR, self.operator)
-        build = _builder(row, author, retracts, note, marks, layer)
+        build = _builder(row, author, by, retracts, note, marks, layer)
         key = row.number, author
         tried: list[int] = []
 
@@ -53,7 +56,7 @@ class OperatorCommits:
             commit = self._store.append_built(row, author, build_next).id
         except _LostNumberError:
             self.operator = new_incarnation()
-            return self.append(row, retracts=retracts, note=note, marks=marks, layer=layer)
+            return self.append(row, by=by, retracts=retracts, note=note, marks=marks, layer=layer)
         except (BadInputError, ConflictError):  # refused, so that the number stays free
             raise
         except Exception:  # it may be kept: the number counts as used
@@ -75,6 +78,7 @@ class _LostNumberError(ConflictError):
 def _builder(
     row: MapRow,
     author: Author,
+    by: str,
     retracts: tuple[CommitId, ...],
     note: str,
     marks: tuple[Mark, ...],
@@ -102,6 +106,7 @@ def _builder(
             retracts=meta.retracted_ids,
             diff={},
             tops={},
+            via=by or None,
             marks=marks,
             layer=layer,
         )

@@ -52,7 +52,7 @@ class Retracts:
             return Retracted(id=None, commits=names)
         parts = [targets[start : start + RETRACTS_MAX] for start in range(0, len(targets), RETRACTS_MAX)]
         try:
-            ids = [str(self.commits.append(row, retracts=tuple(part), note=request.note)) for part in parts]
+            ids = [str(self.commits.append(row, by=by.name, retracts=tuple(part), note=request.note)) for part in parts]
         except EvidenceGoneError as exc:
             self._wanted.note(row.name, exc.commits, asker=OPERATOR)
             raise

@@ -395,7 +395,10 @@ export class Console {
     this.dutyPanel.onAsking = (asking) => openAsking(this.duties, asking);
     this.dutyPanel.onFull = (robot) => openFull(this.api, this.info.name, this.duties, robot);
     this.team.onFollow = () => this.stage.draw();
-    this.camera.onGo = () => this.say("");
+    this.camera.onGo = () => {
+      this.say("");
+      this.findings.cutAgain();
+    };
     this.camera.onWalk = () => {
       this.walker.begin();
       this.say(WALKING);

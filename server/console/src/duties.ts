@@ -1,12 +1,12 @@
 /** What waits for an operator: robots that ask to be let in, and shares of the map's bounds that are half used.
  *
- * Both are asked for now and then, as no live event tells of them. Who may only read is refused once, and then no more
+ * Both are asked for now and then, as no live event tells of them, and not on a screen that nobody sees. Who may only read is refused once, and then no more
  * is asked, nor shown. */
 
 import { ApiError, type Api } from "./api.ts";
 import type { AskingRobot, RobotKeys, RobotUse } from "./messages.ts";
 
-const REFRESH_MS = 10_000;
+const REFRESH_MS = 60_000;
 /** Part of a share above which it is pointed out, and robots that a map has places for: PROTOCOL.md section 6. */
 const ALARM_PART = 0.5;
 const PLACES = 256;
@@ -40,7 +40,7 @@ export class Duties {
 
   /** A few times a second. */
   tick(): void {
-    if (!this.isMine || this.isAsking || performance.now() < this.askAtMs) return;
+    if (!this.isMine || this.isAsking || document.hidden || performance.now() < this.askAtMs) return;
     this.askAtMs = performance.now() + REFRESH_MS;
     void this.ask();
   }

@@ -55,6 +55,8 @@ export class FindingsDesk {
   all: readonly Finding[] = [];
   isMarking = false;
   chosen: string | null = null;
+  /** Heights that were cut off before a finding beyond them was flown to; null: none were. */
+  private cut: Pick<Look, "floorM" | "ceilingM" | "clip" | "isCeilingChosen"> | null = null;
   /** A flight whose end is still to be looked at. */
   private flight: { place: Vector3; witness: Vector3 | null; left: number } | null = null;
   /** Finding that a link names, until it is there. */
@@ -173,6 +175,7 @@ export class FindingsDesk {
 
   forget(): void {
     this.stopMarking();
+    this.cutAgain();
     this.flight = null;
     this.choose(null);
   }
@@ -197,9 +200,11 @@ export class FindingsDesk {
   fly(id: string): void {
     const found = this.all.find((one) => one.id === id);
     if (!found) return;
+    this.cutAgain();
     const place = new Vector3(...found.place);
     const where = `Finding ${found.number}: ${found.celsius === null ? found.title : `${found.celsius.toFixed(1)} °C`} at ${place.toArray().map((value) => value.toFixed(2)).join(", ")} m`;
     const hidden = !isShown(place);
+    const { floorM, ceilingM, clip, isCeilingChosen } = this.look;
     if (hidden) {
       // What was cut off for a better view hides what is looked for.
       this.look.floorM = this.look.ceilingM = this.look.clip = null;
@@ -209,8 +214,18 @@ export class FindingsDesk {
     const from = found.spot?.commit ? this.acts.witness(found.spot.commit) : null;
     this.flight = { place, witness: from && new Vector3(...from), left: FLIGHTS_MAX };
     this.acts.fly(this.view(this.flight));
+    this.cut = hidden ? { floorM, ceilingM, clip, isCeilingChosen } : null;
     this.choose(id); // after the flight began: Back leads to where it was not chosen
     this.acts.say(hidden ? `${where}. It was cut off: all heights are shown now.` : where);
+  }
+
+  /** Who leaves a finding that was cut off gets the cut back, unless they cut elsewhere meanwhile. */
+  cutAgain(): void {
+    const { cut, look } = this;
+    this.cut = null;
+    if (!cut || look.floorM !== null || look.ceilingM !== null || look.clip) return;
+    Object.assign(look, cut);
+    this.acts.look();
   }
 
   private view(flight: { place: Vector3; witness: Vector3 | null; left: number }): CameraView {

@@ -29,7 +29,7 @@ async function mapsOf(why: string): Promise<MapInfo[]> {
         await logIn(api, api.token ? error.message : why);
         continue;
       }
-      message("The server does not answer", error.message);
+      message("The server does not answer", error.message, "If it stays so, see that this computer is in the server's network, and that the server runs.");
       await pause();
     }
   }

@@ -16,6 +16,8 @@ export interface TakenOut {
   readonly whenS: number | null;
   /** Commit that says so: its author, and for an administrator the line of the audit log. */
   readonly by: string | null;
+  /** Token of the operator who asked for it, or of the relay that brought it; null: a robot's own commit. */
+  readonly token: string | null;
   readonly note: string;
 }
 
@@ -164,5 +166,11 @@ function commitsOf(entries: readonly LogEntry[]): Commit[] {
 }
 
 function takenOutBy(seq: number, by: LogEntry | undefined): TakenOut {
-  return { seq, whenS: by?.pushed_s ?? null, by: by?.id ?? null, note: by?.note ?? "" };
+  return { seq, whenS: by?.pushed_s ?? null, by: by?.id ?? null, token: by?.via ?? null, note: by?.note ?? "" };
+}
+
+/** Who took a commit out: a robot, or an operator by the name of the token. */
+export function whoTookOut({ by, token }: TakenOut): string {
+  const robot = by === null ? "" : robotOf(by);
+  return token === null ? robot : `${token} (${robot})`;
 }

@@ -13,6 +13,7 @@ from cairn_map.codec.cell_code import decode_cell
 from cairn_map.commits.ids import OPERATOR, Author
 from cairn_map.errors import DeniedError
 from cairn_map.evidence.grid import cell_of_key
+from cairn_map.wire.messages import Retract
 from cairn_server.access.auth import Caller, Role
 from cairn_server.sync.retracting import seal_of
 
@@ -51,6 +52,18 @@ def test_retract_twice_subtracts_once(live: Live) -> None:
         live.folded(row)
     assert read(live.cells(row)) == sum_of(commits[1:])
     assert [entry["kind"] for entry in live.http.get(f"/maps/{row.name}/log").json()] == ["+", "+", "+", "-", "+"]
+
+
+def test_the_log_names_the_token_that_asked_for_a_retract(live: Live) -> None:
+    row = live.new_map()
+    commit = pushed(0, 0)
+    live.push(row, commit)
+    request = Retract(commits=[str(commit.id)], note="the head was knocked")
+    live.service.sync.retracts.retract(row, request, by=Caller(Role.OPERATOR, name="anna"))
+    live.folded(row)
+    entries = live.http.get(f"/maps/{row.name}/log").json()
+    assert [(entry["via"], entry["note"]) for entry in entries if entry["retracts"]] == [("anna", request.note)]
+    assert {entry["via"] for entry in entries if not entry["retracts"]} == {None}
 
 
 def test_retract_of_a_robot_takes_out_what_it_pushed_and_nothing_else(live: Live) -> None:

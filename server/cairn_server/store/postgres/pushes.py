@@ -114,7 +114,7 @@ def append_slowly(connection: Connection, row: MapRow, commit: NewCommit, *, age
         return damaged is not None
     check_kept(connection, row, commit.retracts)
     admit_commit(connection, row, commit.id.author, commit.grounds)
-    note_number(connection, row, commit.id, is_carried=commit.via is not None)
+    note_number(connection, row, commit.id, is_carried=commit.is_carried)
     count_kept(connection, row, commit.id.author, commit.size_bytes)
     values = _values(row, commit, age_s)
     if commit.tops:

@@ -59,7 +59,7 @@ def append_commit(connection: apsw.Connection, row: MapRow, commit: NewCommit, *
         return damaged is not None
     check_kept(connection, row, commit.retracts)
     admit_commit(connection, row, commit.id.author, commit.grounds)
-    note_number(connection, row, commit.id, is_carried=commit.via is not None)
+    note_number(connection, row, commit.id, is_carried=commit.is_carried)
     charged = take_sums(connection, row, commit)
     count_kept(connection, row, commit.id.author, commit.size_bytes)
     connection.execute(

@@ -47,6 +47,8 @@ export class Pins {
     if (state === this.shown) return;
     this.shown = state;
     this.pins = findings.slice(0, PINS_MAX).map((one) => ({ pin: this.pin(one, one.id === chosen), place: new Vector3(...one.place), width: 0 }));
+    // What matters most lies over what matters less.
+    this.pins.forEach(({ pin }, n) => (pin.style.zIndex = String(pin.classList.contains("chosen") ? PINS_MAX + 1 : PINS_MAX - n)));
     this.element.replaceChildren(...this.pins.map(({ pin }) => pin));
     const rest = findings.slice(PINS_MAX).flatMap(({ place }) => place);
     this.dots.geometry.dispose();

@@ -30,6 +30,9 @@ export class CameraPanel {
   private readonly stage: Stage;
   private readonly cells: Cells;
   private readonly team: Team;
+  /** View of all of the map that was given last, and the picture's width by its height at that time. */
+  private whole = "";
+  private aspect = 0;
 
   constructor(stage: Stage, cells: Cells, team: Team, info: MapInfo, camera: CameraView | null) {
     this.stage = stage;
@@ -50,15 +53,21 @@ export class CameraPanel {
     );
   }
 
-  /** Look at what there is, once all of it is there, unless the operator looks elsewhere already. */
+  /** Look at what there is, once all of it is there, unless the operator looks elsewhere already; and again where a phone is turned. */
   settle(): void {
-    if (this.isPlaced || this.cells.firstPictureMs === null) return;
+    const { aspect } = this.stage.camera;
+    const isTurned = aspect !== this.aspect && JSON.stringify(this.stage.view) === this.whole;
+    this.aspect = aspect;
+    if (this.cells.firstPictureMs === null || (this.isPlaced && !isTurned)) return;
     this.isPlaced = true;
     this.stage.place(this.stage.lookAt(this.cells.tightBoxes, SIDE));
+    this.whole = JSON.stringify(this.stage.view);
   }
 
   home(): void {
-    this.go(this.stage.lookAt(this.cells.tightBoxes, SIDE));
+    const all = this.stage.lookAt(this.cells.tightBoxes, SIDE);
+    this.go(all);
+    this.whole = JSON.stringify(all);
   }
 
   top(): void {
@@ -91,9 +100,9 @@ export class CameraPanel {
 
   /** Fly somewhere, and follow nobody any more. */
   go(to: CameraView): void {
-    this.onGo();
     this.isPlaced = true;
     this.team.follow(null);
-    this.stage.fly(to);
+    this.stage.fly(to); // first, so that Back leads to what was shown until now
+    this.onGo();
   }
 }

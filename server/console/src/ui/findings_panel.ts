@@ -88,13 +88,14 @@ export class FindingsPanel {
   }
 
   private row(one: Finding, { chosen, isOperator }: FindingsShown): HTMLElement {
-    const { id, number, state, title, celsius, entry } = one;
+    const { id, number, state, title, celsius, entry, spot } = one;
+    const overM = spot?.over_floor_m ?? null;
     const isChosen = id === chosen;
     const button = h(
       "button",
       { type: "button", class: "find", "data-find": id, "aria-pressed": String(isChosen), title: number < 10 ? `Fly there (${number})` : "Fly there", onclick: () => this.onFly(id) },
       h("b", { class: "no" }, String(number)), h("strong", {}, celsius === null ? title : `${celsius.toFixed(1)} °C`),
-      h("span", { class: "state", "data-state": state }, STATES[state]),
+      overM === null ? null : h("span", { class: "hint", title: "Height over the floor" }, `at ${overM.toFixed(1)} m`), h("span", { class: "state", "data-state": state }, STATES[state]),
     );
     if (!isChosen) return h("li", {}, button);
     const act = (what: Act, name: string) => h("button", { type: "button", "data-find": `${what} ${id}`, onclick: () => this.onAct(what, id) }, name);

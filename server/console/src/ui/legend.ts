@@ -72,7 +72,7 @@ export class Legend {
       bar(stopsOf(palette), openEnds(look.field, range, values), isAge), this.ends(look.field, range, told, values),
       ...beyond(look.field, range, values), look.field === "temperature" || isOfGround(look.field) ? bare : null,
       ...(isAge ? agesSaid(range, told) : []),
-      isAge && told.log !== "whole" ? h("p", {}, told.log === "read" ? READING : `or older: changed ${FAR}`) : null,
+      isAge && told.log !== "whole" ? h("p", { class: "hint" }, told.log === "read" ? READING : `or older: changed ${FAR}`) : null,
     );
     controls()[focused]?.focus();
   }
@@ -114,13 +114,13 @@ function byCell({ cellM }: Told): HTMLElement {
 /** Ages as times of day, as people tell them. */
 function agesSaid([low, high]: [number, number], told: Told): HTMLElement[] {
   const { newestS } = told;
-  return newestS === null ? [byCell(told)] : [h("p", {}, `from ${clock(newestS - high)} to ${clock(newestS - low)}`), byCell(told)];
+  return newestS === null ? [byCell(told)] : [h("p", { class: "hint" }, `before the newest measurement: from ${clock(newestS - high)} to ${clock(newestS - low)}`), byCell(told)];
 }
 
 function titleOf(field: Field, told: Told, { shift }: Values): string {
   const { label, unit } = FIELDS.find((one) => one.field === field)!;
   if (field === "difficulty") return "Difficulty for a usual vehicle";
-  if (field === "age") return `Age by cell, ${told.unit} before the newest measurement`;
+  if (field === "age") return `Age by cell, ${told.unit}`;
   if (field === "height" && shift) return `Height over the floor, ${unit}`;
   return `${label}${unit ? `, ${unit}` : ""}`;
 }

@@ -1,10 +1,10 @@
 /** Taking commits out again: what, then what that would name, then for good. */
 
-import type { Api } from "../api.ts";
+import { ApiError, type Api } from "../api.ts";
 import { facts, fill, h } from "../dom.ts";
 import { robotOf } from "../log_book.ts";
 import type { LogEntry, Retracted, RetractRequest } from "../messages.ts";
-import type { TakenOut } from "../timeline.ts";
+import { whoTookOut, type TakenOut } from "../timeline.ts";
 import { bytes, clock, counted } from "../units.ts";
 
 const OPERATOR = "operator";
@@ -46,7 +46,7 @@ export function openCommit(api: Api, map: string, entry: LogEntry, { mayRetract,
       ["seen", entry.captured_s ? clock(last) : "unknown"],
       ["came", entry.pushed_s ? clock(entry.pushed_s) : "unknown"],
       ["size", `${bytes(entry.size_bytes)} in ${counted(entry.cells, "cell", "cells")}`],
-      ["came by", entry.via ?? (robot === OPERATOR ? "an operator" : "its robot")],
+      ["came by", entry.via ? `token ${entry.via}` : robot === OPERATOR ? "an operator" : "its robot"],
       ...(entry.note ? [["note", entry.note] as [string, string]] : []),
     ]),
     ...(isRetract ? [h("h3", {}, "It takes out"), listOf(entry.retracts)] : []),
@@ -91,7 +91,7 @@ export function openCommit(api: Api, map: string, entry: LogEntry, { mayRetract,
     const changes = h("p", { role: "status" }, "Looking what it changes …");
     fill(said, h("p", {}, `${counted(found.commits.length, "commit", "commits")}:`), listOf(found.commits), changes);
     stepAside(dialog);
-    changes.textContent = await inMap({ commits: shown, preview: true }).catch((error: Error) => error.message);
+    changes.textContent = await inMap({ commits: shown, preview: true }).catch(uncoloured);
   });
   confirm.addEventListener("click", async () => {
     confirm.disabled = preview.disabled = true;
@@ -115,11 +115,18 @@ export function openCommit(api: Api, map: string, entry: LogEntry, { mayRetract,
   dialog.showModal();
 }
 
+/** Why the map does not show what would change: of one commit alone there is no smaller question. */
+function uncoloured(error: Error): string {
+  if (error instanceof ApiError && error.kind === "too_large") return "It changes more voxels than the map can colour. Nothing is taken out yet.";
+  return error.message;
+}
+
 /** What an operator must know first: that it is out already, and why. */
-function outFacts({ whenS, by, note }: TakenOut): HTMLElement {
+function outFacts(out: TakenOut): HTMLElement {
+  const { whenS, by, note } = out;
   return h(
     "div", { class: "out" }, h("strong", {}, "Taken out of the map"),
-    facts([["when", whenS === null ? "unknown" : clock(whenS)], ["by", by === null ? "unknown" : h("span", {}, robotOf(by), " in ", h("code", {}, by))], ["why", note || "no note"]]),
+    facts([["when", whenS === null ? "unknown" : clock(whenS)], ["by", by === null ? "unknown" : h("span", {}, whoTookOut(out), " in ", h("code", {}, by))], ["why", note || "no note"]]),
   );
 }
 

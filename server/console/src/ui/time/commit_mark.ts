@@ -1,8 +1,7 @@
 /** The mark of a commit, or of several, on the time axis: full, hollow and struck if taken out, a cross for who takes out. */
 
 import { svg } from "../../dom.ts";
-import { robotOf } from "../../log_book.ts";
-import type { Commit } from "../../timeline.ts";
+import { whoTookOut, type Commit } from "../../timeline.ts";
 import { bytes, clock, counted } from "../../units.ts";
 import type { Cluster } from "./clusters.ts";
 
@@ -22,8 +21,9 @@ export function nameOf({ entry, timeS, out, isRetract }: Commit): string {
 }
 
 /** When, by whom and why: as far as that is known. */
-export function outText({ whenS, by, note }: NonNullable<Commit["out"]>): string {
-  return `taken out${whenS === null ? "" : ` ${clock(whenS)}`}${by === null ? "" : ` by ${robotOf(by)}`}${note ? `: ${note}` : ""}`;
+export function outText(out: NonNullable<Commit["out"]>): string {
+  const { whenS, by, note } = out;
+  return `taken out${whenS === null ? "" : ` ${clock(whenS)}`}${by === null ? "" : ` by ${whoTookOut(out)}`}${note ? `: ${note}` : ""}`;
 }
 
 function nameOfMany(commits: readonly Commit[]): string {
