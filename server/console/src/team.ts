@@ -141,7 +141,7 @@ export class Team {
     const followed = this.followed === null ? undefined : this.signs.get(this.followed);
     this.picture.show(this.followed, followed?.view_s ?? null);
     this.fromPose.show(this.followed, followed?.status?.pose ?? null, field, head);
-    if (performance.now() >= this.askAtMs) {
+    if (performance.now() >= this.askAtMs && !document.hidden) {
       this.askAtMs = performance.now() + REFRESH_MS;
       void this.ask();
     }
