@@ -12,6 +12,7 @@ from cairn_fusion.mapping.integrate import Integrator, Method, integrate_scan, i
 from cairn_fusion.mapping.ray_casting import carried
 from cairn_fusion.recording.scan import Scan
 from cairn_fusion.transfer.covariance_grid import CovarianceGrid
+from cairn_fusion.transfer.transfer import depth_steps
 from cairn_map.evidence.channels import classes_channel
 from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.grid import Geometry, geometry_for, level_geometry
@@ -44,6 +45,7 @@ def warm_up() -> None:
     integrate_scans([scan, scan], rig, Geometry(), integrator=Integrator(), threads=2)
     integrate_scan(scan, rig, Geometry(), integrator=Integrator(method=Method.CAST))
     carried(np.zeros((1, 3)), np.eye(4))  # points of a sweep
+    depth_steps(np.ones((2, 2, 3)))
     integrate_scan(scan, rig, level_geometry(), integrator=Integrator())
     labelled = replace(scan, labels={"tof": np.zeros((2, 2), np.uint8)}, label_names={0: "wall"})
     classed = geometry_for(voxel_edge_m=0.05, channels=(classes_channel(("wall",)),))

@@ -14,7 +14,10 @@ from tests.console.browsing import TABLET, UPRIGHT, VIEW, Console, browser
 
 FIELDS = ("colour", "temperature", "probability", "height", "age", "robot")
 VOXELS_IN_SIGHT = """Array.from({length: 100}, (_, n) => [120 + 54 * (n % 10), 120 + 38 * Math.floor(n / 10)])
-    .filter(([x, y]) => c.picker.at(x, y)?.isVoxel)"""
+    .filter(([x, y]) => {
+        const { left, top } = document.querySelector(".host canvas").getBoundingClientRect();
+        return c.picker.at(x, y)?.isVoxel && document.elementFromPoint(left + x, top + y)?.matches(".host canvas");
+    })"""
 SIZES = (VIEW, TABLET, UPRIGHT)
 
 

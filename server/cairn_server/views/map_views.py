@@ -400,9 +400,10 @@ def _evidence(stored: CellRow | None, task: _Task) -> Evidence:
     """
     if stored is None:
         raise DamagedDataError("damaged_store", "a cell is listed, but is not there")
-    if task.until_s is None:
-        return stored_reading(stored, task.row)
-    return past_reading(task.snapshot, stored, task.row, task.until_s)
+    with DECODING.of_cell(task.row.geometry, stored.voxels):
+        if task.until_s is None:
+            return stored_reading(stored, task.row)
+        return past_reading(task.snapshot, stored, task.row, task.until_s)
 
 
 def _etag(head: Cursor, request: RenderRequest) -> str:

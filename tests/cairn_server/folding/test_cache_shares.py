@@ -14,7 +14,7 @@ from cairn_server.views import hot_spot_search, map_views
 def test_the_standard_sizes_of_all_caches_add_up() -> None:
     of_reading = (read_cache.EVIDENCE_BYTES, read_cache.STAMPS_BYTES, read_cache.CHANGES_BYTES, read_cache.DIFFS_BYTES)
     of_spots = (hot_spot_search.PIECES_BYTES, hot_spot_search.WITNESSES_BYTES)
-    of_views = (map_views.CELLS_BYTES, map_views.LISTS_BYTES, *of_spots)
+    of_views = (map_views.CELLS_BYTES, map_views.GROUND_BYTES, map_views.LISTS_BYTES, *of_spots)
     assert sum((fold_memory.CACHE_BYTES, *of_reading, read_cache.HISTORIES_BYTES, *of_views)) == CACHES_BYTES
 
 
