@@ -30,8 +30,10 @@ REST_LOOK_S = 0.05
 """Time between two looks for commits to other maps while those with commits rest."""
 POLL_S = 0.2
 """Time between two looks for commits that came by another server of the same store."""
-CLAIM_MAX = 16
-"""Maps that are claimed at a time, so that processes that fold together share them by how fast they are."""
+LOOK_MAX = 16
+"""Maps that are looked at at a time, and claimed where as many wait."""
+CLAIM_MAX = 4
+"""Of fewer so many are claimed, so that processes that fold together share them by how fast they are."""
 LOOK_S = 0.02
 """Time between two looks at a plan in the background."""
 CLOCKS_EVERY_S = 60.0
@@ -190,17 +192,21 @@ class FoldThread:
         return waiting + [row for row in planned if row.number not in known]
 
     def _claimed(self, leases: FoldLeases) -> list[MapRow]:
-        """Up to some `CLAIM_MAX` maps that wait, do not rest and are no other process's, from the last ones on.
+        """Some maps that wait, do not rest and are no other process's, from the last ones on.
 
         Where more wait than are folded, what a look costs does not grow with them.
         """
         found: dict[int, MapRow] = {}
         start, is_round = self._claimed_to, self._claimed_to < 0
         while len(found) < CLAIM_MAX:
-            seen = self._store.next_waiting(after=self._claimed_to, limit=CLAIM_MAX)
-            mine = leases.claim(self._rests.awake(seen), holder=self._holder, new_max=CLAIM_MAX)
+            seen = self._store.next_waiting(after=self._claimed_to, limit=LOOK_MAX)
+            new_max = LOOK_MAX if len(seen) == LOOK_MAX else CLAIM_MAX
+            mine = leases.claim(self._rests.awake(seen), holder=self._holder, new_max=new_max)
             found |= {row.number: row for row in mine}
-            self._claimed_to = seen[-1].number if len(seen) == CLAIM_MAX else -1
+            if len(mine) >= CLAIM_MAX:
+                self._claimed_to = mine[-1].number  # others of these may be free
+            else:
+                self._claimed_to = seen[-1].number if len(seen) == LOOK_MAX else -1
             if is_round and (self._claimed_to < 0 or self._claimed_to >= start >= 0):
                 break
             is_round |= self._claimed_to < 0

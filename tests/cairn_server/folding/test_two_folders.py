@@ -15,7 +15,7 @@ from tests.memory_store.store import MemoryStore
 
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.folding.damaged_cells import DamagedCells
-from cairn_server.folding.fold_thread import CLAIM_MAX, FoldThread
+from cairn_server.folding.fold_thread import LOOK_MAX, FoldThread
 from cairn_server.folding.readiness import FoldHealth
 from cairn_server.metrics import ServerFigures
 from cairn_server.store.store import LEASE_S
@@ -122,8 +122,8 @@ def test_what_one_folded_while_it_had_lost_its_claim_is_not_folded_twice(store: 
 def test_of_many_maps_that_wait_each_has_its_turn_and_no_look_lists_them_all(
     store: MemoryStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rows, folded, looks = maps_of(store, 2 * CLAIM_MAX + 3), list[int](), list[int]()
-    more = {row.number: iter(COMMITS[1:4]) for row in rows[:CLAIM_MAX]}
+    rows, folded, looks = maps_of(store, 2 * LOOK_MAX + 3), list[int](), list[int]()
+    more = {row.number: iter(COMMITS[1:4]) for row in rows[:LOOK_MAX]}
     next_waiting = store.next_waiting
 
     def looked(*, after: int, limit: int) -> list[MapRow]:
@@ -142,10 +142,10 @@ def test_of_many_maps_that_wait_each_has_its_turn_and_no_look_lists_them_all(
     thread = folder(store, on_fold=pushed_again)
     until(lambda: not store.waiting_maps(), "all is folded")
     thread.close()
-    assert max(looks) == CLAIM_MAX
+    assert max(looks) == LOOK_MAX
     # Maps that robots push to all the time let each other one have its turn.
-    others = [folded.index(row.number) for row in rows[CLAIM_MAX:]]
-    assert max(others) < min(nth(folded, row.number, 2) for row in rows[:CLAIM_MAX])
+    others = [folded.index(row.number) for row in rows[LOOK_MAX:]]
+    assert max(others) < min(nth(folded, row.number, 2) for row in rows[:LOOK_MAX])
 
 
 def nth(found: list[int], wanted: int, n: int) -> int:
