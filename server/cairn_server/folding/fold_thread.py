@@ -33,7 +33,7 @@ POLL_S = 0.2
 LOOK_MAX = 16
 """Maps that are looked at at a time, and claimed where as many wait."""
 CLAIM_MAX = 4
-"""Of fewer so many are claimed, so that processes that fold together share them by how fast they are."""
+"""Maps that are claimed where fewer wait, so that processes that fold together share them by how fast they are."""
 LOOK_S = 0.02
 """Time between two looks at a plan in the background."""
 CLOCKS_EVERY_S = 60.0
