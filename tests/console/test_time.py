@@ -134,7 +134,7 @@ def test_a_moment_seen_before_asks_the_server_for_nothing(console: Console) -> N
 
 
 def test_after_a_step_any_other_move_ends_the_look_ahead(console: Console) -> None:
-    """What is fetched ahead is where one more step would lead."""
+    """The moment of one more step in the same direction is fetched ahead."""
     for move in ("c.time.showNow()", "c.time.show(a[0])", "c.time.follow()"):
         assert console.tell("(c.time.step(-1), c.time.isLookingAhead)")
         assert not console.tell(f"({move}, c.time.isLookingAhead)", START_S)

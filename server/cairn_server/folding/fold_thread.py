@@ -124,22 +124,26 @@ class FoldThread:
                 self._wake.set()
 
     def _fold_all(self) -> bool:
-        """Fold until nothing is pending, one group of each map in turn; False if a map failed."""
+        """Fold until nothing is pending, one group of each map in turn; False if a map failed.
+
+        A round of all maps that wait may take several looks (`_claimed`): it ends where `_claimed_to` is -1 again.
+        """
         failed: set[str] = set()
         planned: list[MapRow] = []  # the one of which commits are planned in the background
         rests = self._rests
         busy = True
-        while (busy or planned or rests) and not self._closing.is_set():
+        while (busy or planned or rests or self._claimed_to >= 0) and not self._closing.is_set():
+            is_amid = self._claimed_to >= 0
             # A plan in the background does not report its end. Nor is a map that rests a reason to let others wait.
-            if not busy:
+            if not (busy or is_amid):
                 (self._wake if planned else self._closing).wait(LOOK_S if planned else rests.left_s())
             # Cleared before the look, so that a commit that comes during it wakes the thread again; and only if it was
             # set: a commit that comes when the wait has just ended would wait for the plan otherwise.
             is_woken = self._wake.is_set()
             if is_woken:
                 self._wake.clear()
-            is_news = busy or is_woken or bool(rests)
-            busy = False
+            is_news = busy or is_amid or is_woken or bool(rests)
+            busy = busy and is_amid  # of all looks of a round
             self._watch_clocks(time.monotonic())
             self.upkeep.work()  # here, too: while robots push all the time, this loop has no end
             try:
@@ -192,25 +196,22 @@ class FoldThread:
         return waiting + [row for row in planned if row.number not in known]
 
     def _claimed(self, leases: FoldLeases) -> list[MapRow]:
-        """Some maps that wait, do not rest and are no other process's, from the last ones on.
+        """The next maps that wait, do not rest and are no other process's: `CLAIM_MAX` or more, or the last of a round.
 
         Where more wait than are folded, what a look costs does not grow with them.
         """
-        found: dict[int, MapRow] = {}
-        start, is_round = self._claimed_to, self._claimed_to < 0
-        while len(found) < CLAIM_MAX:
+        found: list[MapRow] = []
+        while True:
             seen = self._store.next_waiting(after=self._claimed_to, limit=LOOK_MAX)
-            new_max = LOOK_MAX if len(seen) == LOOK_MAX else CLAIM_MAX
-            mine = leases.claim(self._rests.awake(seen), holder=self._holder, new_max=new_max)
-            found |= {row.number: row for row in mine}
+            is_end = len(seen) < LOOK_MAX
+            mine = leases.claim(self._rests.awake(seen), holder=self._holder, new_max=CLAIM_MAX if is_end else LOOK_MAX)
+            found += mine
             if len(mine) >= CLAIM_MAX:
                 self._claimed_to = mine[-1].number  # others of these may be free
-            else:
-                self._claimed_to = seen[-1].number if len(seen) == LOOK_MAX else -1
-            if is_round and (self._claimed_to < 0 or self._claimed_to >= start >= 0):
-                break
-            is_round |= self._claimed_to < 0
-        return list(found.values())
+                return found
+            self._claimed_to = -1 if is_end else seen[-1].number
+            if is_end or len(found) >= CLAIM_MAX:
+                return found
 
     def _watch_clocks(self, now_s: float) -> None:
         """Keep the store's age, and report a jump of the wall clock, at most once in `CLOCKS_EVERY_S`."""

@@ -237,7 +237,7 @@ def test_maps_that_are_folded_in_turn_share_one_memory_and_keep_their_cells_in_i
 
 
 def test_maps_give_up_no_cells_that_there_is_memory_for() -> None:
-    """Of four maps that fill the memory together none is decoded again for each commit."""
+    """Four maps fill the memory together, and none is decoded again for each commit."""
     store = MemoryStore()
     folding = LocalFolding(store, DamagedCells())
     rows = [store.create_map(f"hall{n}", SMALL, SensorModel())[0] for n in range(5)]

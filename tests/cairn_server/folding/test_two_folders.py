@@ -14,13 +14,17 @@ from tests.memory_store.leases import MemoryLeases
 from tests.memory_store.store import MemoryStore
 
 from cairn_map.evidence.inverse_sensor_model import SensorModel
+from cairn_server.folding import fold_thread
 from cairn_server.folding.damaged_cells import DamagedCells
 from cairn_server.folding.fold_thread import LOOK_MAX, FoldThread
+from cairn_server.folding.group_folding import Folded, LocalFolding
 from cairn_server.folding.readiness import FoldHealth
 from cairn_server.metrics import ServerFigures
 from cairn_server.store.store import LEASE_S
 from cairn_server.store.store_rows import MapRow
 
+WAIT_S = 600.0
+"""Longer than any test waits."""
 COMMITS = [pushed(n, n, author) for n in range(6) for author in (MOLE, WREN)]
 
 
@@ -146,6 +150,25 @@ def test_of_many_maps_that_wait_each_has_its_turn_and_no_look_lists_them_all(
     # Maps that robots push to all the time let each other one have its turn.
     others = [folded.index(row.number) for row in rows[LOOK_MAX:]]
     assert max(others) < min(nth(folded, row.number, 2) for row in rows[:LOOK_MAX])
+
+
+def test_a_map_waits_for_none_of_those_that_cannot_be_folded(
+    store: MemoryStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """So are all maps whose cells lie in an object store that is away."""
+    monkeypatch.setattr(fold_thread, "POLL_S", WAIT_S)
+    rows = sorted(maps_of(store, 3 * LOOK_MAX), key=lambda row: row.number)
+    fold = LocalFolding.fold
+
+    def held_up(self: LocalFolding, row: MapRow, *, is_news: bool = True) -> Folded:
+        return fold(self, row, is_news=is_news) if row == rows[-1] else Folded(0, None)
+
+    monkeypatch.setattr(LocalFolding, "fold", held_up)
+    for row in rows:
+        store.append(row, new_of(COMMITS[0]))
+    thread = folder(store)
+    until(lambda: store.waiting_maps() == sorted(rows[:-1], key=lambda row: row.name), "what can be folded is")
+    thread.close()
 
 
 def nth(found: list[int], wanted: int, n: int) -> int:
