@@ -42,7 +42,7 @@ from cairn_map.queries.layers.layered_snapshot import LayeredSnapshot
 from cairn_map.queries.map_snapshot import snapshot_of
 from cairn_map.queries.native.point_handle import PointHandle
 from cairn_map.render.camera_rays import look_at, pinhole
-from cairn_map.render.ground_picture import ground_cell, ground_of
+from cairn_map.render.ground_picture import ground_cell, ground_columns
 from cairn_map.render.map_picture import layer_picture, layer_values
 from cairn_map.render.map_render import MapRenderer
 from cairn_map.render.partial_map import ReadCell, draw_as_needed, read_cell
@@ -136,7 +136,7 @@ def warm_up_pictures() -> None:
             _draw(read_cell(cell, GEOMETRY, model, layer), model, layer)
     level = level_geometry()
     voted = packed_evidence(np.zeros(1, np.uint32), np.ones((1, 2), np.int32), np.ones((1, 2), np.int64), level)
-    ground = ground_of({_key(): ground_cell(voted, _key(), level, model)}, level)
+    ground = ground_columns({_key(): ground_cell(voted, _key(), level, model)}, level)
     ground.seen(pinhole(4, 4, focal_px=4), look_at((-1, 0.1, 0.1), (0, 0, 0)), range_max_m=2.0)
 
 

@@ -115,7 +115,7 @@ class MemoryStore:
             return [maps[name].row for name in sorted(maps) if any(kept.is_due for kept in maps[name].commits.values())]
 
     def next_waiting(self, *, after: int, limit: int) -> list[MapRow]:
-        """The first of these maps whose numbers are above one, by number."""
+        """Maps with commits to be folded whose numbers are above `after`, by number: the first `limit`."""
         rows = sorted(self.waiting_maps(), key=lambda row: row.number)
         return [row for row in rows if row.number > after][:limit]
 

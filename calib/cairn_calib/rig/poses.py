@@ -102,7 +102,7 @@ def quaternion_from_transform(T_dst_src: Transform) -> npt.NDArray[np.float64]:
 
 
 def quaternions_from_transforms(T_dst_src: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """(N, 4) of `quaternion_from_transform` for (N, 4, 4) transforms."""
+    """(N, 4) unit quaternions x y z w of the rotations of (N, 4, 4) transforms, as `quaternion_from_transform`."""
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = np.moveaxis(T_dst_src[:, :3, :3], 0, 2)
     # Bar-Itzhack: the quaternion is the eigenvector of K to its largest eigenvalue; no case split, no cancellation.
     K = np.array(

@@ -7,6 +7,7 @@ A robot's name is bound to one key on the map, in all its layers, so a new folde
 token of the map counts on all layers, one of a layer on that layer alone.
 """
 
+import logging
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import closing
 from pathlib import Path
@@ -19,7 +20,9 @@ from cairn_client.robot.membership import own_token
 from cairn_client.robot.robot import Robot
 from cairn_map.commits.ids import RobotName
 from cairn_map.epochs.layer import EVIDENCE
-from cairn_map.errors import BadInputError, ConflictError
+from cairn_map.errors import BadInputError, ConflictError, DamagedDataError
+
+log = logging.getLogger(__name__)
 
 
 class LayerFolders:
@@ -65,6 +68,9 @@ class LayerFolders:
             try:
                 store = ReplicaStore(path.parent)
             except ConflictError:  # another program of this robot is at work in it
+                continue
+            except DamagedDataError as exc:
+                log.warning("layer %s lends nothing: %s", layer, exc.message)
                 continue
             with closing(store):
                 state = ReplicaState(store)

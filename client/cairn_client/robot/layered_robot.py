@@ -48,7 +48,7 @@ from cairn_fusion.recording.scan import Scan
 from cairn_map.commits.commit import Commit
 from cairn_map.commits.ids import map_of_layer, robot_name
 from cairn_map.epochs.layer import EVIDENCE, MapLayer
-from cairn_map.errors import BadInputError, CairnError, DeniedError, NotFoundError, UnreachableError, first_error
+from cairn_map.errors import BadInputError, CairnError, DeniedError, NotFoundError, first_error
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_map.queries.layers.layered_snapshot import LayeredSnapshot
 from cairn_map.wire.layer_messages import Assignment, MappedLayer
@@ -369,7 +369,7 @@ class LayeredRobot:
         server_url = split_map_url(self._map_url)[0]
         own = {layer: own_token(robot.replica.state, self._map_url) for layer, robot in self._robots.items()}
         asking: list[tuple[str, str | None]] = []
-        asking += [(layer, token) for layer, token in own.items() if token is not None][:1]
+        asking += [(layer, token) for layer, token in own.items() if token is not None]
         if not asking:  # at a start, and before the first registration
             asking += [(EVIDENCE, self._token), *self._folders.tokens(opened=own)]
         while True:
@@ -389,9 +389,9 @@ class LayeredRobot:
         """
         try:
             self._take(self._asked())
-        except UnreachableError:
-            raise
         except CairnError as exc:  # the rounds of the layers prove who asks, and report what is refused
+            if exc.kind == "no_link":
+                raise
             log.warning("the assigned layers are unknown now: %s: %s", exc.kind, exc.message)
         self._reconcile()
 

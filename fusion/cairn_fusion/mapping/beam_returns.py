@@ -24,9 +24,9 @@ from cairn_calib.rig.rig import MountedCamera, Rig
 from cairn_fusion.mapping.brick_tally_kernels import returned_points
 from cairn_fusion.mapping.clear_kernels import (
     bridge_gaps_into,
+    classify_ranges_into,
     interpolated,
     nearest_around,
-    sort_ranges_into,
     stay_before_into,
 )
 from cairn_fusion.mapping.flying_kernels import flying_pixels
@@ -124,7 +124,7 @@ def returns_of(
     silent_m = min(mounted.known_sensing.no_return_clears_m or 0.0, max_range_m)
     range_m, shield_m = np.empty(true_m.shape, np.float32), np.empty(true_m.shape, np.float32)
     silent, missing = np.empty(true_m.shape, bool), np.empty(true_m.shape, bool)
-    whole, no_return, saturated, too_near, too_far, flying = sort_ranges_into(
+    whole, no_return, saturated, too_near, too_far, flying = classify_ranges_into(
         range_m,
         shield_m,
         silent,
@@ -196,7 +196,7 @@ def clear_image(returns: Returns, mounted: MountedCamera, *, voxel_edge_m: float
 
 
 def sigma_image(mounted: MountedCamera, range_m: Singles) -> Floats:
-    """(H, W) of `MountedCamera.range_sigma_image`."""
+    """(H, W) standard deviation of an image's ranges, metres: the values of `MountedCamera.range_sigma_image`."""
     if mounted.range_bias is not None:
         return mounted.range_sigma_image(range_m)
     return interpolated(range_m.ravel(), mounted.range_noise_nodes).reshape(range_m.shape)

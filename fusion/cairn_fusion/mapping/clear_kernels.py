@@ -38,7 +38,7 @@ GRAZING_MAX = 3.0
 
 
 @nb.njit(cache=True, nogil=True)
-def sort_ranges_into(
+def classify_ranges_into(
     range_m: Singles,
     shield_m: Singles,
     silent: Flags,

@@ -6,11 +6,12 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from cairn_calib.rig.poses import Transform, quaternions_from_transforms
+from cairn_calib.rig.poses import Transform, check_transform, quaternions_from_transforms
 from cairn_calib.rig.rig import Rig
 from cairn_fusion.mapping.beam_returns import ReturnCounts
 from cairn_fusion.mapping.integrate import Integration, Integrator
 from cairn_fusion.recording.scan import Scan
+from cairn_fusion.recording.scan_units import check_time
 from cairn_map.commits.commit import ScanPose
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.evidence import Evidence
@@ -28,8 +29,8 @@ class Measurement:
     geometry: Geometry
     integrator: Integrator = field(default_factory=Integrator)
     _integration: Integration = field(init=False)
-    _poses: list[ScanPose] = field(default_factory=list)
-    _newest: list[tuple[float, Transform]] = field(default_factory=list)
+    _poses: list[ScanPose] = field(init=False, default_factory=list)
+    _newest: list[tuple[float, Transform]] = field(init=False, default_factory=list)
     """Times and poses of the scans that are not in `_poses` yet."""
 
     def __post_init__(self) -> None:
@@ -71,9 +72,12 @@ class Measurement:
         A body without a pose of its own is in the rig's frame.
 
         Raises:
-            BadInputError: not (N, 3) points, or the measurement is full; nothing was added.
+            BadInputError: not (N, 3) points, a pose or time that is none, or the measurement is full; nothing was
+                added.
         """
         self._check_room()
+        check_time(time_s)
+        T_map_rig = check_transform(T_map_rig, name="T_map_rig")  # a copy: the caller may write over its own
         body = T_map_rig if T_map_body is None else T_map_body
         self._integration.add_points(points, T_map_sensor, range_camera=range_camera, T_map_body=body)
         self._note_pose(time_s, T_map_rig)

@@ -21,7 +21,7 @@ from cairn_fusion.mapping.sample_kernels import add_pixels_into, doubt_edges_int
 from cairn_fusion.recording.scan import Scan
 from cairn_fusion.transfer.pixel_covariance import PlaceBounds, spread_m
 from cairn_fusion.transfer.transfer import CameraPair, Label, Transfer, transfer_points
-from cairn_fusion.transfer.transfer_kernels import examine_into, points_of_pixels
+from cairn_fusion.transfer.transfer_kernels import list_doubtful_into, points_of_pixels
 from cairn_map.arrays import Flags, Floats, Int32s, Ints
 from cairn_map.evidence.channels import Channel, ChannelKind
 from cairn_map.evidence.grid import Geometry
@@ -39,7 +39,7 @@ class SampleLimits:
     """Largest difference of the thermal image within the area of a range pixel, kelvin: at the edge of a hot thing it
     is unknown which side the range belongs to. Infinite: no limit."""
     hidden_behind_m: float
-    """That of `transfer_points`."""
+    """Depth behind the nearest point of a bin from which on a point is hidden, metres (`transfer_points`)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,7 +89,7 @@ class ImageTransfers:
 
         Args:
             voxel_of: (N,) number of each point's voxel.
-            count: of voxels.
+            count: number of voxels.
         """
         geometry = self._sampling.geometry
         sums, numbers = np.zeros((count, geometry.plane_count), np.int64), voxel_of.astype(np.int32, copy=False)
@@ -128,7 +128,7 @@ class ImageTransfers:
         """Transfer of all points into a camera's image; points with too uncertain a place there are so labelled.
 
         Args:
-            name: of the camera.
+            name: name of the camera.
             spoken: (U,) voxels that need no sample any more: none of their points is OK.
             voxel_of: (N,) number of each point's voxel.
         """
@@ -141,7 +141,7 @@ class ImageTransfers:
         labels, doubtful = transfer.labels, np.empty(len(transfer.labels), np.int32)
         of_points = (points.range_m, points.sigma_m)
         spread = (bounds.baseline_m, bounds.calibration, limits.spread_max_m)
-        count = examine_into(labels, doubtful, voxel_of, spoken, *of_points, *spread)
+        count = list_doubtful_into(labels, doubtful, voxel_of, spoken, *of_points, *spread)
         if count:
             found = doubtful[:count]
             spread_of = spread_m(points.tof[:, found].T, points.sigma_m[found], self._rig, src=src, dst=name)

@@ -32,7 +32,8 @@ def check_time(time_s: float) -> None:
     Raises:
         BadInputError: kind `bad_units`, with the likely unit.
     """
-    if abs(time_s) > LATEST_S:
+    # Written so that NaN is refused, too.
+    if not abs(time_s) <= LATEST_S:
         raise BadInputError(
             "bad_units",
             f"time_s is {time_s:.0f}: milliseconds, microseconds or nanoseconds? It is UTC seconds since 1970",

@@ -132,7 +132,7 @@ def hide_into(
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def examine_into(
+def list_doubtful_into(
     labels: Labels,
     doubtful: Int32s,
     voxel_of: Int32s,
@@ -143,7 +143,7 @@ def examine_into(
     calibration: float,
     limit_m: float,
 ) -> int:
-    """Label points of voxels that have a sample NO_READING; returns the number of points with too uncertain a place.
+    """Label points of voxels that have a sample NO_READING, and list those whose place may be too uncertain: how many.
 
     Args:
         labels: (N,) only points labelled OK are examined.
@@ -152,8 +152,8 @@ def examine_into(
         spoken: (U,) voxels that have a sample.
         range_m: (N,)
         sigma_m: (N,) standard deviation of the ranges.
-        baseline_m: of `pixel_covariance.PlaceBounds`.
-        calibration: the same.
+        baseline_m: distance of the cameras (`pixel_covariance.PlaceBounds`).
+        calibration: standard deviation of a direction by calibration, as a tangent.
         limit_m: largest uncertainty of a place.
     """
     count = 0

@@ -161,6 +161,13 @@ def cells_in_sight(
     return np.asarray(near & ((away_m <= half_m) | (off <= widest + spread)))
 
 
+def with_cells_around(cells: npt.NDArray[np.int64], are_seen: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    """(C,) True for those of (C, 3) cells that are seen, or touch one that is."""
+    turns = np.stack(np.meshgrid(*3 * [[-1, 0, 1]], indexing="ij"), axis=-1).reshape(-1, 3)
+    wanted = {tuple(place) for turn in turns for place in (cells[are_seen] + turn).tolist()}
+    return np.array([tuple(place) in wanted for place in cells.tolist()], np.bool_)
+
+
 @lru_cache(maxsize=2)
 def _span(sight: CameraRays) -> tuple[Floats, float]:
     """Mean direction of all rays, and the widest angle of one from it; pi: all around, NaN: no ray looks anywhere."""

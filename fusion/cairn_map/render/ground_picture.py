@@ -1,7 +1,7 @@
 """A level as a camera sees it: its surfaces at their own heights, coloured by height, slope, step or difficulty.
 
     cells = {key: ground_cell(evidence, key, geometry, model)}       what is drawn of each: surfaces and obstacles
-    ground = ground_of(cells, geometry)                              columns, with what those around them say
+    ground = ground_columns(cells, geometry)                              columns, with what those around them say
     image = ground.seen(sight, T_map_camera, range_max_m=50)         for each pixel the surface that it sees
     layer_picture(image.values(Layer.SLOPE), image.seen, scale, shade=image.shade)
 
@@ -29,17 +29,17 @@ from cairn_map.queries.map_snapshot import MapSnapshot
 from cairn_map.queries.point_queries import first_of_kind
 from cairn_map.render.camera_rays import CameraRays, checked_pose
 from cairn_map.render.ground_kernels import Columns, see_ground_into, surroundings_into
-from cairn_map.render.map_picture import Ages, no_ground
+from cairn_map.render.map_picture import Ages, not_level_error
 from cairn_map.render.map_render import SurfaceImage, changed_at
 from cairn_map.render.render_picture import GROUND_LAYERS, Layer
 
 Item = TypeVar("Item", bound=np.generic)
 FALL_MAX_M = 0.6
 """Surfaces are solid down to the lowest one around, but not as deep as this: below is another surface, or a hole."""
-COLUMNS_MAX = 1 << 24
-"""Columns of the cells of one picture: 64 MB."""
-SPANS_MAX = 1 << 22
-"""Surfaces and obstacles of one picture, some 130 bytes each."""
+COLUMNS_MAX = 1 << 22
+"""Columns of the cells of one picture, and of its table of cells. With `SPANS_MAX` 170 MB while it is made."""
+SPANS_MAX = 1 << 20
+"""Surfaces and obstacles of one picture."""
 SHADE = 0.5
 """Change of brightness where the ground falls by its own width towards the lower right."""
 
@@ -169,7 +169,7 @@ def check_layer(geometry: Geometry, layer: Layer) -> None:
             a level has no temperatures and no colours.
     """
     if layer in GROUND_LAYERS and not geometry.is_flat:
-        raise no_ground(layer)
+        raise not_level_error(layer)
     if geometry.is_flat and layer in (Layer.TEMPERATURE, Layer.COLOUR):
         first_of_kind(geometry, ChannelKind.TEMPERATURE if layer is Layer.TEMPERATURE else ChannelKind.COLOUR)
 
@@ -187,7 +187,7 @@ def ground_cell(evidence: Evidence, key: CellKey, geometry: Geometry, model: Sen
     return GroundCell(shown.voxels, tops_m, is_ground, shown.log_odds(model).astype(np.float64))
 
 
-def ground_of(cells: Mapping[CellKey, GroundCell], geometry: Geometry) -> GroundColumns:
+def ground_columns(cells: Mapping[CellKey, GroundCell], geometry: Geometry) -> GroundColumns:
     """Columns of some cells, in which those that lie above each other are one.
 
     Raises:
@@ -198,7 +198,7 @@ def ground_of(cells: Mapping[CellKey, GroundCell], geometry: Geometry) -> Ground
     slots = np.repeat(np.arange(len(parts), dtype=np.int32), [len(each.places) for each in parts])
     tables, first, table_of, T = _tables([cell_of_key(key)[:2] for key in keys])
     side = geometry.side
-    if max(T * side * side, tables.size) > COLUMNS_MAX or len(places) > SPANS_MAX:
+    if T * side * side > COLUMNS_MAX or len(places) > SPANS_MAX:
         raise BadInputError(
             "too_large",
             f"{T} columns of cells, of {side * side} each, and {len(places)} surfaces are in sight; lower range_m",
@@ -228,31 +228,42 @@ def ground_of(cells: Mapping[CellKey, GroundCell], geometry: Geometry) -> Ground
     return GroundColumns(geometry, keys, columns, slots, places, odds, around, fall_x)
 
 
-def whole_ground(snapshot: MapSnapshot) -> GroundColumns:
-    """Columns of all cells of a level's snapshot.
+def snapshot_ground(snapshot: MapSnapshot, are_wanted: Flags | None = None) -> GroundColumns:
+    """Columns of a level's snapshot: of all cells, or of those of its (C,) cells that are wanted.
 
     Raises:
         BadInputError: kind `too_large`.
     """
     frozen = snapshot.frozen
-    return ground_of(
+    wanted = np.ones(len(frozen.keys), np.bool_) if are_wanted is None else are_wanted
+    return ground_columns(
         {
             key: ground_cell(cell.packed(), key, frozen.geometry, frozen.model)
-            for key, cell in zip(frozen.keys, frozen.cells, strict=True)
+            for key, cell, is_wanted in zip(frozen.keys, frozen.cells, wanted.tolist(), strict=True)
+            if is_wanted
         },
         frozen.geometry,
     )
 
 
 def _tables(cells: Sequence[tuple[int, int]]) -> tuple[Int32s, npt.NDArray[np.int64], npt.NDArray[np.int64], int]:
-    """Tables of columns of cells, (I, J) of one more than each number; the first cell; each cell's number; how many."""
+    """Tables of columns of cells, (I, J) of one more than each number; the first cell; each cell's number; how many.
+
+    Raises:
+        BadInputError: kind `too_large`: the cells lie too far apart for one picture.
+    """
     if not cells:
         return np.zeros((1, 1), np.int32), np.zeros(2, np.int64), np.empty(0, np.int64), 0
     places = np.array(cells, np.int64)
     first = places.min(axis=0)
     different, table_of = np.unique(places, axis=0, return_inverse=True)
-    # Zeros come from the system, page by page when first written: a box that is too large takes nothing.
-    tables = np.zeros(tuple(places.max(axis=0) - first + 1), np.int32)
+    width, length = (places.max(axis=0) - first + 1).tolist()
+    if width * length > COLUMNS_MAX:
+        raise BadInputError(
+            "too_large",
+            f"the cells in sight span {width} x {length}, {COLUMNS_MAX} at most may be; lower range_m",
+        )
+    tables = np.zeros((width, length), np.int32)
     tables[tuple((different - first).T)] = np.arange(1, len(different) + 1)
     return tables, first, table_of.reshape(-1), len(different)
 

@@ -51,10 +51,10 @@ def layer_values(
             # What claims to be later than now is as new as anything.
             return np.maximum(ages.now - renderer.changed(snapshot, seen, ages.changes), 0)
         case Layer.HEIGHT | Layer.SLOPE | Layer.STEP | Layer.DIFFICULTY:
-            raise no_ground(layer)
+            raise not_level_error(layer)
 
 
-def no_ground(layer: Layer) -> BadInputError:
+def not_level_error(layer: Layer) -> BadInputError:
     """The error of a layer of cubes that is asked for what level layers alone have, kind `not_level`."""
     return BadInputError(
         "not_level", f"a {layer} is drawn of a level layer: `cairn map layer add MAP NAME --kind level` makes one"

@@ -176,10 +176,9 @@ class CellCache:
 
     def trim(self) -> None:
         """Drop the cells changed longest ago until the bound holds, all but the newest cell if need be."""
+        while self.size_bytes > self._limit_bytes and len(self._cells) > 1 and (more_bytes := self._more()):
+            self._limit_bytes += more_bytes
         while self.size_bytes > self._limit_bytes and len(self._cells) > 1:
-            if more_bytes := self._more():
-                self._limit_bytes += more_bytes
-                continue
             # The first one was changed longest ago; what is not written yet stays as a draft of its row.
             key = next(iter(self._cells))
             if key in self._changed:

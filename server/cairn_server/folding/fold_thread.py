@@ -14,7 +14,7 @@ from cairn_server.folding.fold_process import FoldProcess, LostProcessError
 from cairn_server.folding.fold_turns import GROUP_S
 from cairn_server.folding.group_folding import GROUP_MAX, Folded, LocalFolding
 from cairn_server.folding.readiness import FoldHealth
-from cairn_server.store.store import FoldLeases, Store
+from cairn_server.store.store import LEASE_S, FoldLeases, Store
 from cairn_server.store.store_rows import MapRow
 from cairn_server.upkeep import Upkeep
 
@@ -31,13 +31,17 @@ REST_LOOK_S = 0.05
 POLL_S = 0.2
 """Time between two looks for commits that came by another server of the same store."""
 LOOK_MAX = 16
-"""Maps that are looked at at a time, and claimed where as many wait."""
+"""Most maps of one page of those that wait, and most that are claimed of a full one."""
 CLAIM_MAX = 4
-"""Maps that are claimed where fewer wait, so that processes that fold together share them by how fast they are."""
+"""Most maps that are claimed of the last page, so that processes that fold together share them by how fast they are."""
+PAGES_MAX = 4
+"""Most pages of one look: where others fold all that wait, a look costs no more than that."""
 LOOK_S = 0.02
 """Time between two looks at a plan in the background."""
 CLOCKS_EVERY_S = 60.0
 """Time between two looks at the clocks."""
+LIST_EVERY_S = 1.0
+"""Time between two lists of all maps that wait, next to other processes and while a fold fails."""
 RETRY_S = 5.0
 """Longest wait before a failed fold (a full disk) is tried again; waits double from `FIRST_RETRY_S` on."""
 FIRST_RETRY_S = 0.2
@@ -75,7 +79,7 @@ class FoldThread:
         self._damaged = damaged
         self._on_fold = on_fold
         self.upkeep = Upkeep(store, keep_evidence_s=keep_evidence_s, may_forget_s=may_forget_s)
-        self._clocks_next_s = 0.0
+        self._clocks_next_s = self._list_next_s = 0.0
         self._wake = threading.Event()
         self._closing = threading.Event()
         self._process = process
@@ -132,11 +136,15 @@ class FoldThread:
         planned: list[MapRow] = []  # the one of which commits are planned in the background
         rests = self._rests
         busy = True
-        while (busy or planned or rests or self._claimed_to >= 0) and not self._closing.is_set():
+        maps: list[MapRow] = []
+        # A map that failed is tried again after a pause, with its plan, too.
+        while not self._closing.is_set() and (
+            busy or rests or self._claimed_to >= 0 or any(row.name not in failed for row in planned)
+        ):
             is_amid = self._claimed_to >= 0
             # A plan in the background does not report its end. Nor is a map that rests a reason to let others wait.
-            if not (busy or is_amid):
-                (self._wake if planned else self._closing).wait(LOOK_S if planned else rests.left_s())
+            if not (busy or (is_amid and maps)):
+                (self._wake if planned else self._closing).wait(LOOK_S if planned else rests.left_s() or REST_LOOK_S)
             # Cleared before the look, so that a commit that comes during it wakes the thread again; and only if it was
             # set: a commit that comes when the wait has just ended would wait for the plan otherwise.
             is_woken = self._wake.is_set()
@@ -151,11 +159,15 @@ class FoldThread:
             except Exception:
                 log.exception("cannot list the maps")
                 return False
+            look_s = time.monotonic()
             # One group of each map in turn: a busy map does not hold up the others.
             for row in rests.awake(maps):
                 if row.name in failed or self._closing.is_set():
                     continue
                 start_s = time.monotonic()
+                if self._store.leases is not None and start_s - look_s > LEASE_S / 2 and row not in planned:
+                    self._claimed_to = row.number - 1  # its claim may end soon: it is claimed again
+                    break
                 try:
                     folded = self._fold_group(row, is_news=is_news)
                     busy |= folded.commits > 0
@@ -187,31 +199,36 @@ class FoldThread:
 
     def _maps_at_work(self, planned: list[MapRow]) -> list[MapRow]:
         """Maps with commits to be folded, and those of which some are planned in the background."""
-        is_alone = self._store.leases is None
-        waiting = self._store.waiting_maps() if is_alone or self._health.has_failures() else []
-        self._health.waiting(row.name for row in waiting)
-        if self._store.leases is not None:
+        if self._store.leases is None:
+            waiting = self._store.waiting_maps()
+            self._health.waiting(row.name for row in waiting)
+        else:
             waiting = self._claimed(self._store.leases)
+            if self._health.has_failures() and time.monotonic() >= self._list_next_s:
+                self._list_next_s = time.monotonic() + LIST_EVERY_S
+                self._health.waiting(row.name for row in self._store.waiting_maps())
         known = {row.number for row in waiting}
         return waiting + [row for row in planned if row.number not in known]
 
     def _claimed(self, leases: FoldLeases) -> list[MapRow]:
-        """The next maps that wait, do not rest and are no other process's: `CLAIM_MAX` or more, or the last of a round.
+        """The next maps of the round that wait, do not rest and are no other process's; none: look again.
 
-        Where more wait than are folded, what a look costs does not grow with them.
+        What a look costs does not grow with the maps that wait.
         """
         found: list[MapRow] = []
-        while True:
+        for _ in range(PAGES_MAX):
             seen = self._store.next_waiting(after=self._claimed_to, limit=LOOK_MAX)
-            is_end = len(seen) < LOOK_MAX
-            mine = leases.claim(self._rests.awake(seen), holder=self._holder, new_max=CLAIM_MAX if is_end else LOOK_MAX)
+            is_last = len(seen) < LOOK_MAX
+            new_max = CLAIM_MAX if is_last else LOOK_MAX
+            mine = leases.claim(self._rests.awake(seen), holder=self._holder, new_max=new_max)
             found += mine
             if len(mine) >= CLAIM_MAX:
                 self._claimed_to = mine[-1].number  # others of these may be free
-                return found
-            self._claimed_to = -1 if is_end else seen[-1].number
-            if is_end or len(found) >= CLAIM_MAX:
-                return found
+                break
+            self._claimed_to = -1 if is_last else seen[-1].number
+            if is_last or len(found) >= CLAIM_MAX:
+                break
+        return found
 
     def _watch_clocks(self, now_s: float) -> None:
         """Keep the store's age, and report a jump of the wall clock, at most once in `CLOCKS_EVERY_S`."""

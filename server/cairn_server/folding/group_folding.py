@@ -302,7 +302,7 @@ class LocalFolding:
         return int((1 - PLAN_SHARE) * self._memory.cells_bytes)
 
     def _given_up(self, name: str) -> int:
-        """Bytes of the map's cells that were dropped for the map of this name; 0: it has half of all memory."""
+        """Bytes of the map's cells that were dropped for the map of this name; 0: it may have half of all."""
         others = {other: cache.size_bytes for other, cache in self._caches.items() if other != name}
         if sum(others.values()) <= self._bound_bytes // 2:
             return 0

@@ -463,7 +463,7 @@ class Store(Protocol):
         ...
 
     def next_waiting(self, *, after: int, limit: int) -> list[MapRow]:
-        """The first `limit` of these maps whose numbers are above one, by number; others cost nothing, either."""
+        """Maps with commits to be folded whose numbers are above `after`, by number: the first `limit`."""
         ...
 
     def maps_with_evidence(self, *, before_s: float) -> list[MapRow]:

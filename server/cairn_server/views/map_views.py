@@ -23,8 +23,8 @@ from cairn_map.errors import BadInputError, DamagedDataError, UnreachableError
 from cairn_map.evidence.brick_cell import brick_cell, reading_cell
 from cairn_map.evidence.evidence import Evidence
 from cairn_map.evidence.grid import CellKey, cell_of_key
-from cairn_map.render.camera_rays import cells_in_sight
-from cairn_map.render.ground_picture import GroundCell, GroundColumns, check_layer, ground_cell, ground_of
+from cairn_map.render.camera_rays import cells_in_sight, with_cells_around
+from cairn_map.render.ground_picture import GroundCell, GroundColumns, check_layer, ground_cell, ground_columns
 from cairn_map.render.map_picture import Ages, arrays_of, layer_picture, layer_values, npz_of
 from cairn_map.render.map_render import MapRenderer, SurfaceImage
 from cairn_map.render.partial_map import Drawing, ReadCell, draw_as_needed, read_cell
@@ -57,7 +57,7 @@ THREADS = 2
 CELLS_BYTES = 224 << 20
 """Memory for cells of all maps that are ready to be drawn."""
 GROUND_BYTES = 32 << 20
-"""Memory for those of level layers."""
+"""Memory for surfaces of level cells that are ready to be drawn."""
 LISTS_BYTES = 64 << 20
 """Memory for lists of cells."""
 LISTED_BYTES = 500
@@ -214,16 +214,16 @@ class MapViews:
 
     def _ground(self, task: _Task, places: Ints, request: RenderRequest) -> GroundColumns:
         """The cells in sight, and those around them: what a surface is, its neighbours say."""
-        inside = self._inside(task, places, request)
-        # Of each cell in sight the 27 around it.
-        turns = np.stack(np.meshgrid(*3 * [[-1, 0, 1]], indexing="ij"), axis=-1).reshape(-1, 3)
-        wanted = {tuple(place) for turn in turns for place in (places[inside] + turn).tolist()}
-        keys = [key for key, place in zip(task.listed, places.tolist(), strict=True) if tuple(place) in wanted]
+        wanted = with_cells_around(places, self._inside(task, places, request))
         found: dict[CellKey, GroundCell] = {}
-        for key in keys:
-            task.check_time()
-            found[key] = self._ground_cells.get(task.ground_name_of(key), partial(_surfaces, task, key))
-        return ground_of(found, task.row.geometry)
+        for key, is_wanted in zip(task.listed, wanted.tolist(), strict=True):
+            if is_wanted:
+                task.check_time()
+                name = task.ground_name_of(key)
+                if self._ground_cells.here(name) is None:
+                    task.count_voxels([key])
+                found[key] = self._ground_cells.get(name, partial(_surfaces, task, key))
+        return ground_columns(found, task.row.geometry)
 
     def _inside(self, task: _Task, places: Ints, request: RenderRequest) -> Flags:
         """(C,) True for the cells that may be in sight."""
@@ -386,7 +386,6 @@ def _ready(stored: CellRow | None, task: _Task) -> ReadCell:
 
 def _surfaces(task: _Task, key: CellKey) -> GroundCell:
     """Surfaces and obstacles of a level's stored cell."""
-    task.count_voxels([key])
     stored = sound_cell(task.snapshot, key, task.row.layer, task.healed)
     with DECODING.of_cell(task.row.geometry, task.listed[key].voxels):
         return ground_cell(_evidence(stored, task), key, task.row.geometry, task.row.sensor_model)

@@ -395,6 +395,7 @@ export class Console {
     this.dutyPanel.onAsking = (asking) => openAsking(this.duties, asking);
     this.dutyPanel.onFull = (robot) => openFull(this.api, this.info.name, this.duties, robot);
     this.team.onFollow = () => this.stage.draw();
+    this.camera.onSearch = () => this.findings.cutAgain();
     this.camera.onGo = () => {
       this.say("");
       this.findings.cutAgain();

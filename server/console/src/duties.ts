@@ -1,6 +1,6 @@
 /** What waits for an operator: robots that ask to be let in, and shares of the map's bounds that are half used.
  *
- * Both are asked for now and then, as no live event tells of them, and not on a screen that nobody sees. Who may only read is refused once, and then no more
+ * Both are asked for now and then, as no live event tells of them, and not while the page is hidden. Who may only read is refused once, and then no more
  * is asked, nor shown. */
 
 import { ApiError, type Api } from "./api.ts";

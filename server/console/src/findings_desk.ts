@@ -219,7 +219,7 @@ export class FindingsDesk {
     this.acts.say(hidden ? `${where}. It was cut off: all heights are shown now.` : where);
   }
 
-  /** Who leaves a finding that was cut off gets the cut back, unless they cut elsewhere meanwhile. */
+  /** Cut off again what a flight to a finding had shown, unless heights were cut elsewhere meanwhile. */
   cutAgain(): void {
     const { cut, look } = this;
     this.cut = null;

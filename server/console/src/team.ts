@@ -20,8 +20,6 @@ import { isOffline, TeamPanel } from "./ui/team_panel.ts";
 /** Live events tell when robots push, fetch and report; what they left out is asked for now and then. */
 const REFRESH_MS = 60_000;
 const SOON_MS = 1000;
-/** Of two tellings how long ago a robot was seen, ms. */
-const TELL_MS = 10_000;
 const OFFLINE_COLOUR = "#8b949e";
 /** Place of the eye that follows a robot, m: so far behind it and over it, or nearer, this far before what is in the way. */
 const BEHIND_M = 3;
@@ -48,7 +46,6 @@ export class Team {
   private readonly cells: Cells;
   private followed: string | null = null;
   private askAtMs = 0;
-  private tellAtMs = 0;
   private wasOffline = new Map<string, boolean>();
 
   constructor(api: Api, map: string, host: HTMLElement, stage: Stage, cells: Cells) {
@@ -144,10 +141,6 @@ export class Team {
     if (performance.now() >= this.askAtMs && !document.hidden) {
       this.askAtMs = performance.now() + REFRESH_MS;
       void this.ask();
-    }
-    if (performance.now() >= this.tellAtMs) {
-      this.tellAtMs = performance.now() + TELL_MS;
-      this.show();
     }
     for (const [name, sign] of this.signs) {
       const offline = isOffline(sign.time_s);

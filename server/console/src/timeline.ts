@@ -169,8 +169,8 @@ function takenOutBy(seq: number, by: LogEntry | undefined): TakenOut {
   return { seq, whenS: by?.pushed_s ?? null, by: by?.id ?? null, token: by?.via ?? null, note: by?.note ?? "" };
 }
 
-/** Who took a commit out: a robot, or an operator by the name of the token. */
+/** Name of the author of a retract: a robot, or the token of the operator for whom the server made it. */
 export function whoTookOut({ by, token }: TakenOut): string {
   const robot = by === null ? "" : robotOf(by);
-  return token === null ? robot : `${token} (${robot})`;
+  return token !== null && robot === "operator" ? `${token} (${robot})` : robot;
 }

@@ -20,10 +20,10 @@ from cairn_fusion.mapping.clear_kernels import (
     GRAZING_SHARE,
     SLANT_SHARE,
     bridge_gaps_into,
+    classify_ranges_into,
     interpolated,
     nearest_around,
     shown_in_window,
-    sort_ranges_into,
     stay_before_into,
 )
 from cairn_fusion.mapping.integrate import Integration, Integrator, Method, integrate_scan
@@ -343,7 +343,7 @@ def test_pixels_are_sorted_by_what_came_back() -> None:
     within = ~(near | far | void | full)
     for is_clear in (False, True):
         range_m, shield_m, silent, missing = (np.empty((9, 13), kind) for kind in (np.float32, np.float32, bool, bool))
-        counts = sort_ranges_into(
+        counts = classify_ranges_into(
             range_m, shield_m, silent, missing, true_m, full, flying, np.float32(0.1), np.float32(10), is_clear
         )
         np.testing.assert_array_equal(shield_m, np.where(within, true_m, np.nan))

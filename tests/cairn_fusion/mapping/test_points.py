@@ -108,6 +108,21 @@ def sweeps(folder: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float6
 
 @pytest.mark.slow
 @pytest.mark.recording
+def test_a_pose_that_is_written_over_or_is_none_spoils_no_measurement() -> None:
+    measurement, T_map_rig = Measurement(lidar_head(), TENTH, FAR), np.eye(4)
+    for n in range(3):  # a driver may have one array for all its poses
+        T_map_rig[0, 3] = n
+        measurement.add_points(np.ones((1, 3)), T_map_rig, T_map_rig=T_map_rig, time_s=float(n))
+    wrong = T_map_rig.copy()
+    wrong[0, 1] = np.nan
+    for pose, time_s, kind in ((T_map_rig, np.nan, "bad_units"), (wrong, 3.0, "bad_transform")):
+        with pytest.raises(BadInputError) as refused:
+            measurement.add_points(np.ones((1, 3)), T_map_rig, T_map_rig=pose, time_s=time_s)
+        assert refused.value.kind == kind
+    assert [pose.t_map_rig[0] for pose in measurement.poses] == [0.0, 1.0, 2.0]
+    assert measurement.captured_s == (0.0, 2.0)
+
+
 def test_two_real_sweeps_agree_with_the_true_pose_and_not_with_its_inverse(test_data: Path) -> None:
     first, second, T = sweeps(test_data / "lpm_lidar")
     rig = Rig(name="car", cameras={"lidar": mount_camera(Spectrum.RANGE, lidar_head()["tof"].camera, np.eye(4))})

@@ -16,7 +16,7 @@ from cairn_fusion.mapping.integrate import Integrator, Method, integrate_scan
 from cairn_fusion.recording.scan import Scan
 from cairn_fusion.transfer.pixel_covariance import PlaceBounds, pixel_covariance, spread_m, spread_px
 from cairn_fusion.transfer.transfer import Label
-from cairn_fusion.transfer.transfer_kernels import OK, examine_into
+from cairn_fusion.transfer.transfer_kernels import OK, list_doubtful_into
 from cairn_map.errors import BadInputError
 from cairn_map.evidence.channels import TEMPERATURE
 from cairn_map.evidence.grid import Geometry
@@ -150,7 +150,7 @@ def test_what_is_taken_for_certain_is(name: str, sigma_px: float | None, noise: 
         labels, doubtful = np.full(len(range_m), OK, np.uint8), np.empty(len(range_m), np.int32)
         voxel_of, spoken = np.arange(len(range_m), dtype=np.int32), np.zeros(len(range_m), np.bool_)
         spread = (bounds.baseline_m, bounds.calibration, limit_m)
-        count = examine_into(labels, doubtful, voxel_of, spoken, range_m, sigma_m, *spread)
+        count = list_doubtful_into(labels, doubtful, voxel_of, spoken, range_m, sigma_m, *spread)
         return ~np.isin(voxel_of, doubtful[:count])
 
     for limit_m in np.quantile(spreads_m[np.isfinite(spreads_m)], [0.0, 0.5, 1.0]):
@@ -163,6 +163,6 @@ def test_points_that_are_hidden_or_need_no_sample_are_not_examined() -> None:
     labels = np.array([OK, OK, Label.OCCLUDED, OK, Label.OUT_OF_VIEW], np.uint8)
     doubtful, voxel_of = np.empty(5, np.int32), np.array([1, 0, 1, 1, 0], np.int32)
     spoken, range_m, sigma_m = np.array([True, False]), np.full(5, 2.0), np.array([0.1, 0.1, 0.1, 0.0, 0.1])
-    assert examine_into(labels, doubtful, voxel_of, spoken, range_m, sigma_m, 0.1, 0.0, 0.01) == 1
+    assert list_doubtful_into(labels, doubtful, voxel_of, spoken, range_m, sigma_m, 0.1, 0.0, 0.01) == 1
     assert doubtful[0] == 0
     assert labels.tolist() == [Label.OK, Label.NO_READING, Label.OCCLUDED, Label.OK, Label.OUT_OF_VIEW]

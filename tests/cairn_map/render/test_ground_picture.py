@@ -9,12 +9,12 @@ from cairn_map.errors import BadInputError
 from cairn_map.evidence.channels import HEIGHT_OFFSET
 from cairn_map.evidence.evidence import packed_evidence
 from cairn_map.evidence.evidence_map import EvidenceMap
-from cairn_map.evidence.grid import CellKey, Geometry, cell_key, split_voxels, voxels_in_cell
+from cairn_map.evidence.grid import CELL_LIMIT, CellKey, Geometry, cell_key, split_voxels, voxels_in_cell
 from cairn_map.queries.map_snapshot import MapSnapshot, snapshot_of
 from cairn_map.render import ground_picture
 from cairn_map.render.camera_rays import look_at, pinhole
 from cairn_map.render.ground_kernels import NO_ROW
-from cairn_map.render.ground_picture import GroundColumns, check_layer, ground_of, whole_ground
+from cairn_map.render.ground_picture import GroundColumns, check_layer, ground_columns, snapshot_ground
 from cairn_map.render.map_picture import Ages, arrays_of, layer_picture
 from cairn_map.render.render_picture import GROUND_LAYERS, NO_VALUE, NOTHING, SCALES, Layer
 
@@ -53,7 +53,7 @@ def rough_ground(seed: int, *, share: float = 1.0) -> list[Surface]:
 
 def test_slopes_steps_and_difficulties_are_those_of_the_elevation() -> None:
     snapshot = level_of([*rough_ground(1, share=0.7), (3, 4, 220, 1), (-5, 2, 160, 1)])
-    elevation, ground = snapshot.elevation(), whole_ground(snapshot)
+    elevation, ground = snapshot.elevation(), snapshot_ground(snapshot)
     rows = np.flatnonzero(ground.columns.is_ground)
     centres = [(np.array(voxel[:2]) + 0.5) * 0.2 for voxel in (places_of(ground)[rows])]
     columns = np.rint((np.array(centres) - elevation.origin_m) / 0.2).astype(int)
@@ -90,7 +90,7 @@ def places_of(ground: GroundColumns) -> np.ndarray[tuple[int, int], np.dtype[np.
     ],
 )
 def test_a_ray_meets_the_nearest_of_all_spans(eye: tuple[float, ...], target: tuple[float, ...]) -> None:
-    ground = whole_ground(level_of([*rough_ground(2, share=0.3), (2, 2, 400, 0), (2, 3, 400, 0), (1, 1, 300, 1)]))
+    ground = snapshot_ground(level_of([*rough_ground(2, share=0.3), (2, 2, 400, 0), (2, 3, 400, 0), (1, 1, 300, 1)]))
     image = ground.seen(SIGHT, T := look_at(eye, target), range_max_m=7.0)
     spans = [
         ((int(x), int(y)), float(bottom), float(top))
@@ -105,7 +105,7 @@ def test_a_ray_meets_the_nearest_of_all_spans(eye: tuple[float, ...], target: tu
 
 
 def test_ground_that_is_known_everywhere_has_no_hole_and_a_bridge_stays_over_its_road() -> None:
-    ground = whole_ground(level_of([*rough_ground(4), *((x, y, 600, 0) for x in range(4) for y in range(-16, 16))]))
+    ground = snapshot_ground(level_of([*rough_ground(4), *((x, y, 600, 0) for x in range(4) for y in range(-16, 16))]))
     above = ground.seen(SIGHT, look_at((1.0, 0.9, 5.0), (0.2, 0.3, 0.0)), range_max_m=20.0)
     assert above.seen.hit[10:20, 15:25].all()
     heights = above.values(Layer.HEIGHT)
@@ -117,7 +117,7 @@ def test_ground_that_is_known_everywhere_has_no_hole_and_a_bridge_stays_over_its
 
 def test_every_layer_of_a_level_is_a_picture_and_others_are_refused() -> None:
     snapshot = level_of([*rough_ground(5, share=0.9), (0, 0, 260, 1)])
-    image = whole_ground(snapshot).seen(SIGHT, look_at((-3, -3, 4), (1, 1, 0)), range_max_m=20.0)
+    image = snapshot_ground(snapshot).seen(SIGHT, look_at((-3, -3, 4), (1, 1, 0)), range_max_m=20.0)
     times = {key: np.full(8 ** (LEVEL.depth - 2), 5.0) for key in image.ground.keys}
     for layer in (*GROUND_LAYERS, Layer.DEPTH, Layer.PROBABILITY, Layer.AGE):
         values = image.values(layer, Ages(times, now=7.0))
@@ -142,7 +142,7 @@ def test_every_layer_of_a_level_is_a_picture_and_others_are_refused() -> None:
 
 
 def test_an_empty_level_shows_nothing_and_one_that_is_too_large_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    nothing = ground_of({}, LEVEL).seen(SIGHT, look_at((0, 0, 1), (1, 0, 0)), range_max_m=5.0)
+    nothing = ground_columns({}, LEVEL).seen(SIGHT, look_at((0, 0, 1), (1, 0, 0)), range_max_m=5.0)
     assert not nothing.seen.hit.any() and np.isnan(nothing.values(Layer.SLOPE)).all()
     for pose, range_m, kind in ((np.zeros((4, 4)), 5.0, "bad_pose"), (np.eye(4), np.nan, "bad_range")):
         with pytest.raises(BadInputError) as refused:
@@ -157,12 +157,12 @@ def test_an_empty_level_shows_nothing_and_one_that_is_too_large_is_refused(monke
             LEVEL,
             snapshot_of(EvidenceMap(LEVEL)).model,
         )
-        for place in ((0, 0, 0), (5000, 5000, 0))
+        for place in ((-CELL_LIMIT, -CELL_LIMIT, 0), (0, 0, 0), (CELL_LIMIT - 1, CELL_LIMIT - 1, 0))
     }
-    with pytest.raises(BadInputError) as refused:
-        ground_of(far, LEVEL)
+    with pytest.raises(BadInputError, match="the cells in sight span 2097152 x 2097152, ") as refused:
+        ground_columns(far, LEVEL)
     assert refused.value.kind == "too_large"
     monkeypatch.setattr(ground_picture, "SPANS_MAX", 10)
     with pytest.raises(BadInputError) as refused:
-        whole_ground(level_of(rough_ground(6)))
+        snapshot_ground(level_of(rough_ground(6)))
     assert refused.value.kind == "too_large"

@@ -13,10 +13,11 @@ from tests.fixtures.server.store_contract import new_of
 from tests.memory_store.leases import MemoryLeases
 from tests.memory_store.store import MemoryStore
 
+from cairn_map.errors import UnreachableError
 from cairn_map.evidence.inverse_sensor_model import SensorModel
 from cairn_server.folding import fold_thread
 from cairn_server.folding.damaged_cells import DamagedCells
-from cairn_server.folding.fold_thread import LOOK_MAX, FoldThread
+from cairn_server.folding.fold_thread import LOOK_MAX, PAGES_MAX, FoldThread
 from cairn_server.folding.group_folding import Folded, LocalFolding
 from cairn_server.folding.readiness import FoldHealth
 from cairn_server.metrics import ServerFigures
@@ -169,6 +170,45 @@ def test_a_map_waits_for_none_of_those_that_cannot_be_folded(
     thread = folder(store)
     until(lambda: store.waiting_maps() == sorted(rows[:-1], key=lambda row: row.name), "what can be folded is")
     thread.close()
+
+
+def test_a_plan_whose_fold_fails_once_is_tried_again(store: MemoryStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The disk may be full for a moment."""
+    [row], calls = maps_of(store, 1), list[MapRow]()
+    fold = LocalFolding.fold
+
+    def planned(self: LocalFolding, row: MapRow, *, is_news: bool = True) -> Folded:
+        calls.append(row)
+        if len(calls) == 1:
+            return Folded(0, None, is_planning=True)
+        if len(calls) == 2:
+            raise UnreachableError("store_failed", "the disk is full")
+        return fold(self, row, is_news=is_news)
+
+    monkeypatch.setattr(LocalFolding, "fold", planned)
+    store.append(row, new_of(COMMITS[0]))
+    thread = folder(store)
+    until(lambda: not store.waiting_maps(), "it is folded after a pause")
+    thread.close()
+
+
+def test_a_look_is_short_where_another_process_folds_all(store: MemoryStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    rows, looks = maps_of(store, 8 * LOOK_MAX), list[int]()
+    assert store.leases is not None
+    store.leases.claim(rows, holder="other", new_max=len(rows))
+    for row in rows:
+        store.append(row, new_of(COMMITS[0]))
+    thread = folder(store)
+    thread.close()
+    next_waiting = store.next_waiting
+
+    def looked(*, after: int, limit: int) -> list[MapRow]:
+        looks.append(after)
+        return next_waiting(after=after, limit=limit)
+
+    monkeypatch.setattr(store, "next_waiting", looked)
+    thread._claimed_to = -1
+    assert thread._claimed(store.leases) == [] and len(looks) == PAGES_MAX
 
 
 def nth(found: list[int], wanted: int, n: int) -> int:

@@ -21,7 +21,7 @@ from cairn_map.codec.cell_code import decode_cell
 from cairn_map.evidence.evidence_map import EvidenceMap
 from cairn_map.evidence.grid import CellKey, cell_key, cell_of_key, level_geometry
 from cairn_map.queries.map_snapshot import snapshot_of
-from cairn_map.render.ground_picture import whole_ground
+from cairn_map.render.ground_picture import snapshot_ground
 from cairn_map.render.legend import with_legend
 from cairn_map.render.map_picture import layer_picture, layer_values
 from cairn_map.render.map_render import MapRenderer
@@ -308,7 +308,7 @@ def test_a_level_is_drawn_as_at_home_and_its_cells_are_kept(live: Live, monkeypa
     look = request_from((i - 2, j - 2, k + 3), (i, j, k), width=64, height=48, focal_px=40.0, range_m=20.0)
     for layer in (Layer.DIFFICULTY, Layer.HEIGHT, Layer.PROBABILITY, Layer.DEPTH):
         request = asking(look, layer=layer, low=0.0, high=4.0)
-        image = whole_ground(snapshot_of(map_of(live, row), row.sensor_model)).seen(
+        image = snapshot_ground(snapshot_of(map_of(live, row), row.sensor_model)).seen(
             look.sight, look.T_map_camera, range_max_m=20.0
         )
         assert image.seen.hit.mean() > 0.05

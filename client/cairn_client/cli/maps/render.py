@@ -37,7 +37,9 @@ from cairn_client.cli.robot_arguments import add_spread_arguments, place, spread
 from cairn_client.cli.source_arguments import add_source_arguments, asked_source
 from cairn_client.folders.map_folder import FolderMap, map_of_folder
 from cairn_map.errors import BadInputError
-from cairn_map.render.ground_picture import check_layer, whole_ground
+from cairn_map.evidence.grid import cell_of_key
+from cairn_map.render.camera_rays import cells_in_sight, with_cells_around
+from cairn_map.render.ground_picture import check_layer, snapshot_ground
 from cairn_map.render.map_picture import arrays_of, layer_picture, layer_values, npz_of
 from cairn_map.render.map_render import MapRenderer
 from cairn_map.render.render_picture import SCALES, Layer, Scale, png_of
@@ -146,7 +148,16 @@ def _look(args: argparse.Namespace, request: RenderRequest, found: FolderMap) ->
     snapshot, scale, spread = found.snapshot, request.scale, request.spread
     if snapshot.geometry.is_flat:
         check_layer(snapshot.geometry, request.layer)
-        image = whole_ground(snapshot).seen(request.sight, request.T_map_camera, range_max_m=request.range_m)
+        cells = np.array([cell_of_key(key) for key in snapshot.frozen.keys], np.int64).reshape(-1, 3)
+        inside = cells_in_sight(
+            cells,
+            request.sight,
+            request.T_map_camera,
+            edges_m=snapshot.geometry.cell_edges_m,
+            range_max_m=request.range_m,
+        )
+        ground = snapshot_ground(snapshot, with_cells_around(cells, inside))
+        image = ground.seen(request.sight, request.T_map_camera, range_max_m=request.range_m)
         seen, values = image.seen, image.values(request.layer, found.ages)
         picture = layer_picture(values, seen, scale, spread, shade=image.shade)
     else:

@@ -53,7 +53,7 @@ WITH RECURSIVE waiting AS (
     FROM waiting WHERE waiting.map IS NOT NULL
 )
 SELECT map FROM waiting WHERE map IS NOT NULL LIMIT %s"""
-"""SQL of the maps above a number that have commits to be folded, by number: a look at each one's first, not at all."""
+"""SQL of the maps above a number that have commits to be folded, by number; of each its first is read, not all."""
 
 
 class _StoredColumns(NamedTuple):
@@ -121,7 +121,7 @@ class PgReads:
         return self.map_rows(f"WHERE map IN ({NEXT_WAITING}) ORDER BY name", (-1, None))
 
     def next_waiting(self, *, after: int, limit: int) -> list[MapRow]:
-        """The first of these maps whose numbers are above one, by number."""
+        """Maps with commits to be folded whose numbers are above `after`, by number: the first `limit`."""
         return self.map_rows(f"WHERE map IN ({NEXT_WAITING}) ORDER BY map", (after, limit))
 
     def maps_with_evidence(self, *, before_s: float) -> list[MapRow]:

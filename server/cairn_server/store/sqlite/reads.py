@@ -51,7 +51,7 @@ class SqliteReads:
         return self.map_rows(f"WHERE number IN ({WAITING_MAPS}) ORDER BY name", ())
 
     def next_waiting(self, *, after: int, limit: int) -> list[MapRow]:
-        """The first of these maps whose numbers are above one, by number."""
+        """Maps with commits to be folded whose numbers are above `after`, by number: the first `limit`."""
         clause = f"WHERE number > ? AND number IN ({WAITING_MAPS}) ORDER BY number LIMIT ?"
         return self.map_rows(clause, (after, limit))
 

@@ -153,7 +153,7 @@ export class Cells {
         const { data } = await this.api.view(this.map, cell.key, depth, { etag: null, atS: moment?.atS ?? null });
         if (data) this.past.put(...name, await this.decoders.decode(data));
       } catch (error) {
-        if (!isUnknownThen(error) && !isNoCell(error)) throw error;
+        if (!isNoCell(error) && !(isUnknownThen(error) && error.kind === "not_known")) throw error;
       }
       if (turns !== this.turns) return;
     }
@@ -402,7 +402,7 @@ function isNoCell(error: unknown): boolean {
   return error instanceof ApiError && error.kind === "no_cell";
 }
 
-/** Whether the server says that it does not know a cell at a past moment, or not within its bounds. */
+/** True where the server does not know a cell at a past moment, or not within its bounds. */
 function isUnknownThen(error: unknown): error is ApiError {
   return error instanceof ApiError && (error.kind === "not_known" || error.kind === "too_costly");
 }

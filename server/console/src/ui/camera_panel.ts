@@ -24,6 +24,8 @@ export class CameraPanel {
   /** The operator wants the hottest place; it is there. */
   onHottest: (place: HotPlace | null) => void = () => {};
   onGo: () => void = () => {};
+  /** Before a place is looked for in what is shown. */
+  onSearch: () => void = () => {};
   onNoFloor: () => void = () => {};
   /** The operator stands in the map. */
   onWalk: () => void = () => {};
@@ -91,6 +93,7 @@ export class CameraPanel {
 
   /** Go to the hottest place that is shown. */
   hottest(): void {
+    this.onSearch();
     const { uLow, uHigh, uMinP } = uniforms;
     const shown = new Box3(uLow.value, uHigh.value);
     const found = hottest(this.cells, (place, p) => shown.containsPoint(place) && p >= uMinP.value);

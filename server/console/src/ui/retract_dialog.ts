@@ -115,7 +115,7 @@ export function openCommit(api: Api, map: string, entry: LogEntry, { mayRetract,
   dialog.showModal();
 }
 
-/** Why the map does not show what would change: of one commit alone there is no smaller question. */
+/** Reason for which the map shows no preview of a retract. */
 function uncoloured(error: Error): string {
   if (error instanceof ApiError && error.kind === "too_large") return "It changes more voxels than the map can colour. Nothing is taken out yet.";
   return error.message;

@@ -10,9 +10,13 @@ const PAUSE_MS = 1500;
 /** After a picture that could not be made: the server may have been busy. */
 const AGAIN_MS = 5000;
 const WAIT_MS = 20_000;
-/** Layer of the server's pictures for each field; fields of a level's ground have none. */
+/** Layer of the server's pictures for each field. */
 const LAYERS: Partial<Record<Field, string>> = {
   colour: "colour", temperature: "temperature", probability: "probability", height: "depth", age: "age", robot: "colour",
+};
+/** The same for a level layer, which has neither colours nor temperatures. */
+const LEVEL_LAYERS: Partial<Record<Field, string>> = {
+  height: "height", slope: "slope", step: "step", difficulty: "difficulty", probability: "probability", age: "age",
 };
 const SIZE = { width: "320", height: "240", focal_px: "250" };
 
@@ -20,25 +24,24 @@ export class RobotMap {
   readonly element = h("figure", { class: "seen", hidden: true });
   private readonly api: Api;
   private readonly map: string;
-  private readonly isLevel: boolean;
+  private readonly layers: Partial<Record<Field, string>>;
   private robot: string | null = null;
   /** Picture that was asked for last. */
   private asked = "";
   private busy = false;
   private nextMs = 0;
 
-  /** `isLevel`: the map is one, of which the server draws no pictures. */
   constructor(api: Api, map: string, isLevel: boolean) {
     this.api = api;
     this.map = map;
-    this.isLevel = isLevel;
+    this.layers = isLevel ? LEVEL_LAYERS : LAYERS;
   }
 
   /** Show the map at log entry `head` from a robot's pose, in the colours of a field; null: no robot is followed. */
   show(robot: string | null, pose: Pose | null, field: Field, head: number): void {
     if (robot !== this.robot || pose === null) this.clear();
     this.robot = robot;
-    const layer = this.isLevel ? undefined : LAYERS[field];
+    const layer = this.layers[field];
     if (robot === null || pose === null || layer === undefined) return;
     const [x, y, z] = pose.t_map_rig;
     const [qx, qy, qz, qw] = pose.q_map_rig;

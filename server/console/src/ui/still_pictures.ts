@@ -5,7 +5,7 @@ import { fill, h, pictureOf } from "../dom.ts";
 import type { Branch, MapInfo, Pose } from "../messages.ts";
 
 const LAYERS = { colour: "Colour", temperature: "Temperature", probability: "Certainty", depth: "Distance", age: "Age" };
-/** Of a level, which has surfaces in the place of colours. */
+/** The same for a level layer, which has surfaces in the place of colours. */
 const OF_LEVEL = { height: "Height", slope: "Slope", step: "Step", difficulty: "Difficulty", probability: "Certainty", depth: "Distance", age: "Age" };
 const SIZE = { width: 640, height: 480, focal_px: 500 };
 /** Farthest that the server looks, m. */
