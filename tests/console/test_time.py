@@ -136,8 +136,10 @@ def test_a_moment_seen_before_asks_the_server_for_nothing(console: Console) -> N
 def test_after_a_step_any_other_move_ends_the_look_ahead(console: Console) -> None:
     """The moment of one more step in the same direction is fetched ahead."""
     for move in ("c.time.showNow()", "c.time.show(a[0])", "c.time.follow()"):
-        # In one go: between two, the page may begin to fetch.
-        before, after = console.tell(f"(c.time.step(-1), b = c.time.isLookingAhead, {move}, [b, c.time.ahead])", START_S)
+        # In one call, so that the page cannot begin to fetch between the two.
+        before, after = console.tell(
+            f"(c.time.step(-1), b = c.time.isLookingAhead, {move}, [b, c.time.ahead])", START_S
+        )
         assert before and after is None
     console.tell("c.time.showNow()")
     console.settled()

@@ -12,6 +12,7 @@ tests/cairn_fusion/mapping/test_class_votes.py has the slow twin.
 """
 
 import numba as nb
+import numpy as np
 
 from cairn_map.arrays import Bytes, Int32s, Ints
 from cairn_map.kernels.integer_kernels import signed
@@ -125,7 +126,7 @@ def add_votes_into(sums: Ints, at: Ints, winners: Ints, weights: Ints) -> None:
 
 
 @nb.njit(nogil=True, forceinline=True)
-def hash_of(x: int, y: int, z: int) -> int:
+def hash_of(x: np.integer, y: np.integer, z: np.integer) -> int:
     """A number from 0 of a voxel, whose lower bits differ for neighbours (Teschner et al. 2003, mixed once more)."""
-    mixed = (signed(x) * 73856093) ^ (signed(y) * 19349663) ^ (signed(z) * 83492791)  # type: ignore[arg-type]
+    mixed = (signed(x) * 73856093) ^ (signed(y) * 19349663) ^ (signed(z) * 83492791)
     return (mixed ^ (mixed >> 15)) & 0x7FFFFFFFFFFFFFFF
